@@ -230,11 +230,11 @@ def _regroup(
     taken = owner >= 0
     count = np.bincount(owner[taken], np.diff(start)[taken], minlength=n).astype(np.int64)
     new_start = np.concatenate(([0], np.cumsum(count)))
-    return new_start, sort_values(new_start, _deal_out(start, z, owner, new_start))
+    return new_start, sort_values(new_start, _merge_by_owner(start, z, owner, new_start))
 
 
 @kernel
-def _deal_out(
+def _merge_by_owner(
     start: NDArray[np.int64], z: NDArray[np.float64], owner: NDArray[np.int64], new_start: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Put the values of each group behind those of the others of its owner; those of -1 are left out."""

@@ -130,7 +130,7 @@ def divide_houses(
         divided = np.flatnonzero(np.bincount(parts.house)[parts.house] > 1)
         roof = None
         if unmarked is not None and unmarked.any():
-            roof = _deal_out_roofs(
+            roof = _collect_roof_points(
                 cloud, HouseParts(parts.polygons[divided], parts.house[divided]), roofs, unmarked
             )
         found = extract_building_points(
@@ -189,7 +189,7 @@ def leave_out_points(points: RoofPoints, without: NDArray[np.bool_]) -> RoofPoin
     return add_roof_points(no_roof_points(len(without)), np.flatnonzero(~without), kept)
 
 
-def _deal_out_roofs(
+def _collect_roof_points(
     cloud: PointCloud, parts: HouseParts, roofs: RoofPoints, unmarked: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Roof points of parts: of class 6 inside, and for unmarked houses those of the house inside."""

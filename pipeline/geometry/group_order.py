@@ -76,7 +76,7 @@ def sort_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> NDArray[n
 @kernel
 def sort_group(xyz: NDArray[np.float64]) -> None:
     """Sort the points of one group, (n, 3), in place, as `sort_points` does; for kernels."""
-    bins = _deal_out(xyz)
+    bins = _sort_into_bins(xyz)
     for k in range(len(bins) - 1):
         _sort(xyz[bins[k] : bins[k + 1]])
 
@@ -95,7 +95,7 @@ def order_values(values: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @kernel
-def _deal_out(xyz: NDArray[np.float64]) -> NDArray[np.int64]:
+def _sort_into_bins(xyz: NDArray[np.float64]) -> NDArray[np.int64]:
     """Put points in order of as many bins of equal height; give where each bin starts."""
     n = len(xyz)
     start = np.zeros(n + 1, np.int64)

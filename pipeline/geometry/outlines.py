@@ -71,8 +71,8 @@ def open_outline(polygon: shapely.Polygon) -> Outline:
     return Outline(rings.xy, rings.ring, polygon)
 
 
-def deal_out(pieces: NDArray[np.object_], xyz: Array) -> Iterator[tuple[Outline, Array]]:
-    """Deal points out to the pieces of a polygon.
+def points_by_piece(pieces: NDArray[np.object_], xyz: Array) -> Iterator[tuple[Outline, Array]]:
+    """Give the points in each piece of a polygon.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def deal_out(pieces: NDArray[np.object_], xyz: Array) -> Iterator[tuple[Outline,
     """
     rings = read_rings(pieces)
     owner = find_owner(pieces, xyz, edges=edges_of_rings(rings))
-    dealt, first = _deal_out(xyz, owner, len(pieces))
+    dealt, first = _sort_by_owner(xyz, owner, len(pieces))
     for k, piece in enumerate(pieces):
         begin, end = rings.start[k], rings.start[k + 1]
         yield Outline(rings.xy[begin:end], rings.ring[begin:end], piece), dealt[first[k] : first[k + 1]]
@@ -111,7 +111,7 @@ def _area(xy: Array, ring: Index) -> float:
 
 
 @kernel
-def _deal_out(xyz: Array, owner: Index, n: int) -> tuple[Array, Index]:
+def _sort_by_owner(xyz: Array, owner: Index, n: int) -> tuple[Array, Index]:
     """Put points in the order of their owners, those of none left out; gives where each owner's begin."""
     start = np.zeros(n + 2, np.int64)
     for k in range(len(xyz)):

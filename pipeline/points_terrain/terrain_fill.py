@@ -213,7 +213,7 @@ def fill_terrain(flooded: FloodedDtm, coarse: Dtm) -> tuple[Dtm, FillCounts]:
     alone. Between coarse nodes it is bilinear. A tile without rings deeper than `RIM` does not read it.
     """
     dtm = flooded.dtm
-    n_coarse = count_deep(flooded)
+    n_coarse = count_coarse(flooded)
     counts = FillCounts(int(np.count_nonzero(flooded.ring)), n_coarse)
     if coarse.spacing != dtm.spacing * COARSE:
         raise ValueError(f"coarse spacing {coarse.spacing} m is not {COARSE} times {dtm.spacing} m")
@@ -227,7 +227,7 @@ def fill_terrain(flooded: FloodedDtm, coarse: Dtm) -> tuple[Dtm, FillCounts]:
     return Dtm(z, dtm.i0, dtm.j0, dtm.spacing), counts
 
 
-def count_deep(flooded: FloodedDtm) -> int:
+def count_coarse(flooded: FloodedDtm) -> int:
     """Count the nodes of a tile for which the coarse level has a weight."""
     return int(np.count_nonzero(flooded.ring > RIM))
 

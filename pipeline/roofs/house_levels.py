@@ -8,7 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.geometry.group_order import sort_points
-from pipeline.geometry.outlines import Outline, deal_out, open_outline
+from pipeline.geometry.outlines import Outline, open_outline, points_by_piece
 from pipeline.geometry.rings import make_canonical
 from pipeline.geometry.segments import add_places
 from pipeline.roofs.cuts import cut_best
@@ -172,7 +172,7 @@ def _cut_to_cells(
             )
             if len(pieces):
                 corners = add_places(corners, ends)
-                todo.extend((part, within, depth - 1) for part, within in deal_out(pieces, inside))
+                todo.extend((part, within, depth - 1) for part, within in points_by_piece(pieces, inside))
                 continue
         cells.append(piece)
         points.append(inside)

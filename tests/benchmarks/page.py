@@ -16,7 +16,7 @@ from typing import Any
 
 from tests.helpers.simulated_runs import simulate, write_events
 from tests.tiler.dashboard.test_dashboard_page import run_browser
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.server import serve
 
 
@@ -44,7 +44,7 @@ def main() -> None:
         folder, out = Path(place), given.out or Path(place)
         out.mkdir(parents=True, exist_ok=True)
         path = write_events(folder, simulate(given.tiles, done=0.6, failed=12, running=8, status="running"))
-        follower = Follower(folder, lambda: True)
+        follower = EventReader(folder, lambda: True)
         begin = time.process_time()
         with follower.lock:
             follower.advance(1e9)

@@ -33,8 +33,8 @@ from tiler.planning.plan import Plan, make_plan
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.store.results import StoredTerrain
+from tiler.workflow.resolved_domain import resolve_domain
 from tiler.workflow.run import run
-from tiler.workflow.settled_domain import settle_domain
 from tiler.workflow.stage_sequence import run_city_stages
 
 CRS = "EPSG:3006"
@@ -248,7 +248,7 @@ def column_arrays(values: dict[str, Any], out: Path, tile: str) -> tuple[dict[st
     config = make_config(values | {"out": str(out)})
     with open_engine(config) as (engine, plan):
         run_city_stages(engine, config)
-        seams, columns = mesh_stages(config, settle_domain(engine, config))
+        seams, columns = mesh_stages(config, resolve_domain(engine, config))
         box = shapely.box(*plan.layout.tiles[tile])
         near = [name for name, line in plan.layout.seams.items() if shapely.box(*line).intersects(box)]
         engine.run(seams, items={"seams": near})

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from tiler.check.proofs import Fault, Proof, find_faults
-from tiler.citymodels.building_index import BuildingRow, has_parts, read_building, read_objects, spool_vertices
+from tiler.citymodels.building_index import BuildingRow, copy_vertices, has_parts, read_building, read_objects
 from tiler.config.zone_levels import find_levels
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
 
@@ -55,8 +55,8 @@ def check_zones(zones: Zones, model: Path, full_model: Path, stated: Mapping[str
 
 def _iterate(path: Path) -> Iterator[tuple[str, Mapping[str, Any], BuildingRow]]:
     """Read the buildings and parts of a city model one at a time: name, object and what is read of it."""
-    with TemporaryFile() as spool:
-        vertices = spool_vertices(path, spool)
+    with TemporaryFile() as vertex_file:
+        vertices = copy_vertices(path, vertex_file)
         for name, thing in read_objects(path):
             if not has_parts(path, thing):
                 yield name, thing, read_building(path, name, thing, vertices)

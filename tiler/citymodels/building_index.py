@@ -116,8 +116,8 @@ def index_buildings(path: Path, folder: Path | None = None) -> Iterator[Building
     (``TMPDIR``).
     """
     with TemporaryFile() if folder is None else (folder / SHAPES).open("w+b") as file:
-        with TemporaryFile() if folder is None else (folder / VERTICES).open("w+b") as spool:
-            vertices = spool_vertices(path, spool)
+        with TemporaryFile() if folder is None else (folder / VERTICES).open("w+b") as vertex_file:
+            vertices = copy_vertices(path, vertex_file)
             index = _read_objects(path, vertices, file)
         if np.any(index.numbers[1:] == index.numbers[:-1]):
             raise InputError(f"{path}: two buildings have one number; give each its own id and run again")
@@ -170,17 +170,17 @@ class Vertices:
         return found
 
 
-def spool_vertices(path: Path, spool: IO[bytes]) -> Vertices:
+def copy_vertices(path: Path, vertex_file: IO[bytes]) -> Vertices:
     """Read all of a CityJSON file, in any layout, but its objects.
 
-    The spool is empty, and to be kept open as long as the vertices are used.
+    The file is empty, and to be kept open as long as the vertices are used.
 
     Raises
     ------
     InputError
         If the file is missing or damaged.
     OutputError
-        If the spool cannot be written.
+        If the file cannot be written.
     """
     try:
         head, large = read_members(path, ("transform", "metadata").__contains__)
@@ -192,9 +192,9 @@ def spool_vertices(path: Path, spool: IO[bytes]) -> Vertices:
         while rows := list(islice(elements, BLOCK)):
             data = _rows(rows)
             with _writing():
-                spool.write(data.data)
-                spool.flush()
-        return Vertices(spool, head)
+                vertex_file.write(data.data)
+                vertex_file.flush()
+        return Vertices(vertex_file, head)
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
 

@@ -122,9 +122,9 @@ def write_city_blocks(
     system = _reference_system(crs)
     origin = np.floor(np.asarray(bounds[:3], dtype=np.float64))
     head = {"type": "CityJSON", "version": "2.0", "transform": {"scale": [GRID] * 3, "translate": origin.tolist()}}
-    with replacing(path) as part, part.open("wb") as file, TemporaryFile(dir=path.parent) as spool:
+    with replacing(path) as part, part.open("wb") as file, TemporaryFile(dir=path.parent) as vertex_file:
         file.write(f"{compact(head)[:-1]},\n".encode("ascii"))
-        writer = _Writer(file, spool, origin)
+        writer = _Writer(file, vertex_file, origin)
         for model, columns in _cut_runs(blocks):
             writer.add(model, columns)
         writer.finish()
@@ -146,7 +146,7 @@ def write_city_blocks(
 class _Writer:
     """Writes objects and vertices, and keeps what must be known at the end."""
 
-    def __init__(self, file: BinaryIO, spool: IO[bytes], origin: NDArray[np.float64]) -> None:
+    def __init__(self, file: BinaryIO, vertex_file: IO[bytes], origin: NDArray[np.float64]) -> None:
         self.file, self.origin = file, origin
         # A version 5 identifier is this hash of a name space and a name: the name is all that we write.
         self.digest = hashlib.sha1(uuid.NAMESPACE_URL.bytes, usedforsecurity=False)
@@ -154,7 +154,7 @@ class _Writer:
         self.notes: list[Note] = []
         self.children: dict[str, list[str]] = {}
         self.hashes: list[NDArray[np.int64]] = []
-        self.lines = ObjectLines(self._write, spool)
+        self.lines = ObjectLines(self._write, vertex_file)
 
     def add(self, model: CityModel, extra: Attributes) -> None:
         """Write the objects of a run."""

@@ -22,8 +22,8 @@ def reference_system(crs: pyproj.CRS | None) -> str | None:
 class ObjectLines:
     """Writes ``CityObjects`` and ``vertices`` of a document, from behind the comma after its head on."""
 
-    def __init__(self, write: Callable[[bytes], object], spool: IO[bytes]) -> None:
-        self._write, self._spool = write, spool
+    def __init__(self, write: Callable[[bytes], object], vertex_file: IO[bytes]) -> None:
+        self._write, self._vertex_file = write, vertex_file
         self.n_objects = self.n_vertices = 0
         write(b'"CityObjects":{')
 
@@ -38,13 +38,13 @@ class ObjectLines:
         if len(rows):
             # All at once: a call for each takes twelve times as long, the encoder of lists three times.
             text = ",\n".join(["[%d,%d,%d]"] * len(rows)) % tuple(rows.ravel().tolist())
-            self._spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
+            self._vertex_file.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
             self.n_vertices += len(rows)
 
     def finish(self) -> None:
         """Write the vertices."""
         self._write(b'\n},\n"vertices":[')
-        self._spool.seek(0)
-        while piece := self._spool.read(COPY_BYTES):
+        self._vertex_file.seek(0)
+        while piece := self._vertex_file.read(COPY_BYTES):
             self._write(piece)
         self._write(b"\n]")

@@ -83,7 +83,7 @@ def height_in_metres(height: Height, tallest: float) -> float:
     return float(height[:-1]) * tallest if isinstance(height, str) else height
 
 
-def settle(height: Height, top: str, facts: Mapping[str, Any]) -> Domain:
+def resolve_height(height: Height, top: str, facts: Mapping[str, Any]) -> Domain:
     """Decide height and top of the domain from what the stage ``domain`` found.
 
     Parameters

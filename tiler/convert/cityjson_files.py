@@ -33,9 +33,9 @@ def feature_line(feature: Feature, source: ModelSource) -> bytes:
 
 def write_document(path: Path, source: ModelSource) -> None:
     """Write CityJSON, an object a line; vertices wait in a temporary file."""
-    with path.open("wb") as file, TemporaryFile() as spool:
+    with path.open("wb") as file, TemporaryFile() as vertex_file:
         file.write(_line(_head(source))[:-2] + b",")
-        lines = ObjectLines(file.write, spool)
+        lines = ObjectLines(file.write, vertex_file)
         for feature in iter_features(source):
             objects = _objects(feature, source, lines.n_vertices)
             lines.add_objects(f"{compact(name)}:{compact(thing)}" for name, thing in objects.items())

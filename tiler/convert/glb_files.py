@@ -34,7 +34,7 @@ LISTS = ("nodes", "meshes", "accessors")
 
 
 @dataclass
-class _Spools:
+class _Buffers:
     """Parts of the file as they grow, each in a temporary file: lists of the document, vertices, corners."""
 
     groups: list[int]  # kinds of faces, in the order of their materials
@@ -64,41 +64,41 @@ def write_glb(path: Path, source: ModelSource, lod: str, *, detailed: bool = Fal
     with ExitStack() as stack:
         files = {name: stack.enter_context(TemporaryFile()) for name in (*LISTS, "vertices", "corners")}
         groups = [*GROUPS, *(DETAILS if detailed else ())]
-        spools = _Spools(groups, {name: files[name] for name in LISTS}, files["vertices"], files["corners"])
+        buffers = _Buffers(groups, {name: files[name] for name in LISTS}, files["vertices"], files["corners"])
         origin = origin_of(source)
         for one in iter_triangles(source, lod):
-            _add(spools, one, origin)
-        if not spools.n["nodes"]:
+            _add(buffers, one, origin)
+        if not buffers.n["nodes"]:
             raise InputError("no building has surfaces above level 0, and GLB no empty meshes; give another --lod")
-        _assemble(path, spools, source)
+        _assemble(path, buffers, source)
 
 
-def _add(spools: _Spools, one: SolidBuilding, origin: Any) -> None:
+def _add(buffers: _Buffers, one: SolidBuilding, origin: Any) -> None:
     corner = one.xyz.min(axis=0)
     # Adding 0 turns -0 into 0.
     local = ((one.xyz - corner)[:, [0, 2, 1]] * [1, 1, -1] + 0.0).astype("<f4")
-    place = {"bufferView": 0, "byteOffset": spools.vertices.tell(), "componentType": FLOAT, "count": len(local)}
+    place = {"bufferView": 0, "byteOffset": buffers.vertices.tell(), "componentType": FLOAT, "count": len(local)}
     low, high = local.min(axis=0).tolist(), local.max(axis=0).tolist()
-    position = spools.append("accessors", place | {"type": "VEC3", "min": low, "max": high})
-    spools.vertices.write(local.tobytes())
+    position = buffers.append("accessors", place | {"type": "VEC3", "min": low, "max": high})
+    buffers.vertices.write(local.tobytes())
     primitives = []
-    for material, kind in enumerate(spools.groups):
+    for material, kind in enumerate(buffers.groups):
         rows = one.triangles[one.kind == kind]
         if not len(rows):
             continue
-        place = {"bufferView": 1, "byteOffset": spools.corners.tell(), "componentType": UNSIGNED_INT}
-        number = spools.append("accessors", place | {"count": 3 * len(rows), "type": "SCALAR"})
-        spools.corners.write(rows.astype("<u4").tobytes())
+        place = {"bufferView": 1, "byteOffset": buffers.corners.tell(), "componentType": UNSIGNED_INT}
+        number = buffers.append("accessors", place | {"count": 3 * len(rows), "type": "SCALAR"})
+        buffers.corners.write(rows.astype("<u4").tobytes())
         primitives.append({"attributes": {"POSITION": position}, "indices": number, "material": material})
-    mesh = spools.append("meshes", {"name": one.id, "primitives": primitives})
+    mesh = buffers.append("meshes", {"name": one.id, "primitives": primitives})
     east, north, up = (corner - origin).tolist()
     node = {"mesh": mesh, "name": one.id, "translation": [east, up, -north + 0.0]}
-    spools.append("nodes", node | ({"extras": one.attributes} if one.attributes else {}))
+    buffers.append("nodes", node | ({"extras": one.attributes} if one.attributes else {}))
 
 
-def _assemble(path: Path, spools: _Spools, source: ModelSource) -> None:
-    split, data = spools.vertices.tell(), spools.corners.tell()
-    n_nodes = spools.n["nodes"]
+def _assemble(path: Path, buffers: _Buffers, source: ModelSource) -> None:
+    split, data = buffers.vertices.tell(), buffers.corners.tell()
+    n_nodes = buffers.n["nodes"]
     head = {
         "asset": {
             "version": "2.0",
@@ -110,7 +110,7 @@ def _assemble(path: Path, spools: _Spools, source: ModelSource) -> None:
             },
         },
         "scene": 0,
-        "materials": [_material(kind) for kind in spools.groups],
+        "materials": [_material(kind) for kind in buffers.groups],
         "bufferViews": [
             {"buffer": 0, "byteLength": split, "target": VERTICES},
             {"buffer": 0, "byteOffset": split, "byteLength": data, "target": INDICES},
@@ -124,9 +124,9 @@ def _assemble(path: Path, spools: _Spools, source: ModelSource) -> None:
             some = ",".join(map(str, range(k, min(k + 10_000, n_nodes))))
             text.write((f",{some}" if k else some).encode("ascii"))
         text.write(b"]}]")
-        for name, spool in spools.lists.items():
+        for name, file in buffers.lists.items():
             text.write(f',"{name}":['.encode("ascii"))
-            _copy(spool, text)
+            _copy(file, text)
             text.write(b"]")
         text.write(b"}")
         text.write(b" " * (-text.tell() % 4))
@@ -138,8 +138,8 @@ def _assemble(path: Path, spools: _Spools, source: ModelSource) -> None:
             file.write(struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", size, b"JSON"))
             _copy(text, file)
             file.write(struct.pack("<I4s", split + data, b"BIN\0"))
-            _copy(spools.vertices, file)
-            _copy(spools.corners, file)
+            _copy(buffers.vertices, file)
+            _copy(buffers.corners, file)
 
 
 def _copy(source: IO[bytes], target: IO[bytes]) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 from tornado.web import HTTPError, RequestHandler
 
 from pipeline.data.errors import CityError
-from tiler.dashboard.answer import tell
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.map_view import Box, Question
 from tiler.dashboard.metrics import CONTENT_TYPE, describe_metrics, write_text
+from tiler.dashboard.page_data import describe_page
 from tiler.dashboard.server import PREFIX
 
 HERE = Path(__file__).parent
@@ -74,7 +74,7 @@ class Base(Guarded):
 
     Parameters
     ----------
-    follower : Follower
+    follower : EventReader
         The run.
     loopback : bool
         See `Guarded`.
@@ -82,7 +82,7 @@ class Base(Guarded):
         Whether Dask's own pages are served beside.
     """
 
-    def initialize(self, follower: Follower, loopback: bool, dask: bool) -> None:
+    def initialize(self, follower: EventReader, loopback: bool, dask: bool) -> None:
         """Take the parameters."""
         self.follower, self.loopback, self.dask = follower, loopback, dask
 
@@ -116,7 +116,7 @@ class Page(Base):
 
 
 class StateOfRun(Base):
-    """The state of the run as JSON, see `tiler.dashboard.answer`."""
+    """The state of the run as JSON, see `tiler.dashboard.page_data`."""
 
     async def get(self) -> None:
         """Answer what the page asks for."""
@@ -130,7 +130,7 @@ class StateOfRun(Base):
 
         def make() -> tuple[str, str]:
             try:
-                found = tell(self.follower, question) | {"dask": self.dask}
+                found = describe_page(self.follower, question) | {"dask": self.dask}
             except CityError as error:
                 found = {"trouble": str(error)}
             return json.dumps(found, separators=(",", ":")), "application/json; charset=utf-8"
@@ -157,7 +157,7 @@ class Home(Base):
         self.redirect(f"{PREFIX}/")
 
 
-def make_rules(follower: Follower, *, loopback: bool, dask: bool, root: bool = False) -> list[Any]:
+def make_rules(follower: EventReader, *, loopback: bool, dask: bool, root: bool = False) -> list[Any]:
     """List the paths for tornado; parameters as of `Base`, and with `root` the path ``/`` leads to the page."""
     given = {"follower": follower, "loopback": loopback, "dask": dask}
     rules: list[Any] = [

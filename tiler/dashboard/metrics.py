@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.data.errors import CityError
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.map_view import LOWEST
 from tiler.monitoring.items import STATES, Items, State
 from tiler.monitoring.run_state import SEAM, TILE, RunState
@@ -106,8 +106,8 @@ def families(model: RunState, *, alive: bool, share: float = 1.0) -> list[Family
     return found
 
 
-def describe_metrics(follower: Follower) -> list[Family]:
-    """Read what is new of a run, and give its metrics; InputError as of `Follower.advance`."""
+def describe_metrics(follower: EventReader) -> list[Family]:
+    """Read what is new of a run, and give its metrics; InputError as of `EventReader.advance`."""
     alive = follower.alive()
     with follower.lock:
         follower.advance()
@@ -138,11 +138,11 @@ class Collector:
 
     Parameters
     ----------
-    follower : Follower
+    follower : EventReader
         The run.
     """
 
-    def __init__(self, follower: Follower) -> None:
+    def __init__(self, follower: EventReader) -> None:
         self._follower = follower
 
     def describe(self) -> list[Any]:

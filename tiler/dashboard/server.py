@@ -11,7 +11,7 @@ from typing import Any
 
 from pipeline.data.errors import ConfigError
 from tiler.config.config import ANYWHERE
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.metrics import Collector
 
 PREFIX = "/citystitch"
@@ -69,12 +69,12 @@ def is_loopback(host: str) -> bool:
 
 
 @contextmanager
-def serve(follower: Follower, address: str = ANYWHERE) -> Iterator[str]:
+def serve(follower: EventReader, address: str = ANYWHERE) -> Iterator[str]:
     """Serve the page of a run by a server of its own, in a thread; gives its URL.
 
     Parameters
     ----------
-    follower : Follower
+    follower : EventReader
         The run.
     address : str
         Where to listen, see `read_address`.
@@ -149,12 +149,12 @@ def serve_rules(
 
 
 @contextmanager
-def mounted(follower: Follower, scheduler: Any, address: str) -> Iterator[str]:
+def mounted(follower: EventReader, scheduler: Any, address: str) -> Iterator[str]:
     """Show the page of a run on the HTTP server of its Dask scheduler, in this process; gives its URL.
 
     Parameters
     ----------
-    follower : Follower
+    follower : EventReader
         The run.
     scheduler : distributed.Scheduler
         The scheduler.
@@ -193,7 +193,7 @@ def watched(out: Path, address: str | None, scheduler: Any | None, say: Callable
     if address is None:
         yield
         return
-    follower = Follower(out, lambda: True)
+    follower = EventReader(out, lambda: True)
     page = serve(follower, address) if scheduler is None else mounted(follower, scheduler, address)
     with page as url:
         say(f"dashboard: {url}")
@@ -229,7 +229,7 @@ def show_folder(folder: Path, address: str, say: Callable[[str], None]) -> None:
     ConfigError
         If nobody can listen there.
     """
-    follower = Follower(folder)
+    follower = EventReader(folder)
     with follower.lock:
         follower.advance(0.0)
     with serve(follower, address) as url, suppress(KeyboardInterrupt):
@@ -239,7 +239,7 @@ def show_folder(folder: Path, address: str, say: Callable[[str], None]) -> None:
 
 
 @contextmanager
-def _registered(follower: Follower) -> Iterator[None]:
+def _registered(follower: EventReader) -> Iterator[None]:
     try:
         from prometheus_client import REGISTRY
     except ImportError:

@@ -17,7 +17,7 @@ from tiler.editing.requests import (
     read_buildings,
     read_date,
 )
-from tiler.editing.staging import begin, commit, forget, link_folder, settle
+from tiler.editing.staging import begin, commit, finish_interrupted, forget, link_folder
 from tiler.editing.uploads import read_upload
 from tiler.engine.executor import Executor
 from tiler.engine.schedule import StoppedError
@@ -75,7 +75,7 @@ def held_city(directory: Path, workers: int = 0, say: Callable[[str], None] = sa
     """
     refuse_bucket(directory, "an edit")
     with only_run(_finished(directory), say):
-        settle(directory, say)
+        finish_interrupted(directory, say)
         record, config = _read_run(directory, workers)
         region = record["region"]
         yield City(directory, config, region["crs"], tuple(region.get("core", region["bounds"])))
@@ -162,7 +162,7 @@ def edit_together(
         What came of each: one that is refused leaves the others as they are. Where the mesh cannot be made with
         all of them, each has a transaction of its own.
     """
-    settle(city.directory, say)
+    finish_interrupted(city.directory, say)
     journal = read_journal(city.directory)
     given, found = read_buildings(city.directory), list[Edit | CityError]()
     for one in asked:
@@ -243,7 +243,7 @@ def city_at(
     if out.exists():
         raise ConfigError(f"{out}: is there already; give another --out")
     with only_run(_finished(directory), say):
-        settle(directory, say)
+        finish_interrupted(directory, say)
         _, config = _read_run(directory, workers, out)
         with replacing_folder(out) as work:
             link_folder(directory, work)
@@ -261,7 +261,7 @@ def list_edits(directory: Path, say: Callable[[str], None] = say_nothing) -> lis
     refuse_bucket(directory, "the journal")
     if not is_held(_finished(directory)):
         with only_run(directory, say):
-            settle(directory, say)
+            finish_interrupted(directory, say)
     return read_journal(directory)
 
 

@@ -45,8 +45,8 @@ def begin(directory: Path) -> Path:
 def commit(directory: Path) -> int:
     """Move what has changed in the second folder to the first; gives the number of files.
 
-    From the moment at which the list of these is on the disk the edit is done: a later call of `settle` goes on
-    with the moves where a kill has ended them.
+    Once the list of these is on the disk the edit is done: after a kill `finish_interrupted` does the moves that
+    are left.
     """
     work = directory / STAGING / WORK
     new, old = set(_files(work)), set(_files(directory))
@@ -58,7 +58,7 @@ def commit(directory: Path) -> int:
     return len(changed)
 
 
-def settle(directory: Path, say: Callable[[str], None]) -> None:
+def finish_interrupted(directory: Path, say: Callable[[str], None]) -> None:
     """Finish or forget what a killed edit has left, and say which; whoever calls this holds the folder."""
     shutil.rmtree(directory / DONE, ignore_errors=True)
     staging = directory / STAGING

@@ -9,7 +9,7 @@ from typing import IO, Any
 import numpy as np
 
 from pipeline.data.errors import InputError
-from tiler.citymodels.building_index import Vertices, has_parts, read_objects, spool_vertices
+from tiler.citymodels.building_index import Vertices, copy_vertices, has_parts, read_objects
 from tiler.export.export import Format
 from tiler.store.atomic import replacing
 from tiler.store.out_folder import CITY_MODEL
@@ -63,11 +63,11 @@ def write_cityjsonseq(path: Path, model: Path) -> None:
     CityJSON 2.0.1, section 8, https://www.cityjson.org/specs/2.0.1/#text-sequences-and-streaming-with-cityjsonfeature
     """
     with (
-        TemporaryFile() as spool,
+        TemporaryFile() as vertex_file,
         TemporaryFile(dir=path.parent) as parts,
         path.open("wb") as file,
     ):
-        vertices = spool_vertices(model, spool)
+        vertices = copy_vertices(model, vertex_file)
         head = {"type": "CityJSON", "version": "2.0", **_pick(vertices.head, ("transform", "metadata"))}
         file.write(_line(head | {"CityObjects": {}, "vertices": []}))
         for name, objects in _features(model, parts):

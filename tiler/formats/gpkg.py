@@ -16,7 +16,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import OutputError
-from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
+from tiler.citymodels.building_index import copy_vertices, has_parts, read_building, read_objects
 from tiler.export.export import Format
 from tiler.mesh_files.run_files import RUN_RECORD
 from tiler.store.atomic import replacing
@@ -78,8 +78,8 @@ def write_gpkg(path: Path, model: Path, *, crs: str) -> None:
     as JSON text. The city model is read three times, an object at a time; memory holds `BATCH` rows.
     """
     kinds = _survey(model)
-    with TemporaryFile() as spool, fixed_time():
-        vertices = spool_vertices(model, spool)
+    with TemporaryFile() as vertex_file, fixed_time():
+        vertices = copy_vertices(model, vertex_file)
         rows = (
             (name, thing, read_building(model, name, thing, vertices).footprint) for name, thing in _objects(model)
         )

@@ -23,7 +23,7 @@ SURFACES = [{"type": name} for name in ("GroundSurface", "RoofSurface", "WallSur
 class HierarchyWriter:
     """Writes objects, an object a line, while vertices wait in another file."""
 
-    def __init__(self, file: IO[bytes], spool: IO[bytes], crs: pyproj.CRS, origin: Sequence[float]) -> None:
+    def __init__(self, file: IO[bytes], vertex_file: IO[bytes], crs: pyproj.CRS, origin: Sequence[float]) -> None:
         self.origin = np.array([*origin, 0.0])
         self.file, self.without_solid = file, 0
         head: dict[str, Any] = {
@@ -34,7 +34,7 @@ class HierarchyWriter:
         if name := reference_system(crs):
             head["metadata"] = {"referenceSystem": name}
         file.write(f"{compact(head)[:-1]},".encode("ascii"))
-        self.lines = ObjectLines(file.write, spool)
+        self.lines = ObjectLines(file.write, vertex_file)
 
     def add(self, rows: Mapping[str, Rows], children: Mapping[str, Sequence[str]]) -> None:
         """Add what a tile has; `children` are the cells of each object of LoD0A.

@@ -282,8 +282,8 @@ def _write(
     origin = [float(min(tile[axis] for tile in owners) * shards.size) for axis in (0, 1)]
     with replacing(files.gpkg) as gpkg, replacing(files.city_json) as city, fixed_time():
         layers = LayerWriter(gpkg, crs_text(crs))
-        with city.open("wb") as file, TemporaryFile() as spool:
-            hierarchy = HierarchyWriter(file, spool, crs, origin)
+        with city.open("wb") as file, TemporaryFile() as vertex_file:
+            hierarchy = HierarchyWriter(file, vertex_file, crs, origin)
             for tile in owners:
                 ((cells, rows, children),) = shards.read("rows", tile)
                 layers.add(cells, rows)

@@ -418,12 +418,12 @@ class CityMesh:
         InputError
             If the city model is missing or damaged.
         """
-        from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
+        from tiler.citymodels.building_index import copy_vertices, has_parts, read_building, read_objects
         from tiler.store.out_folder import CITY_MODEL
 
         model = self.folder / CITY_MODEL
-        with TemporaryFile() as spool:
-            vertices = spool_vertices(model, spool)
+        with TemporaryFile() as vertex_file:
+            vertices = copy_vertices(model, vertex_file)
             for name, thing in read_objects(model):
                 if has_parts(model, thing):
                     continue

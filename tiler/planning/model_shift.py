@@ -24,7 +24,7 @@ SAMPLE = 2000  # buildings of a file that are looked at
 ROUNDING = 1  # decimals of the shift (m)
 
 
-def settle_shift(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[Config, Plan]:
+def resolve_shift(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[Config, Plan]:
     """Measure the shift of the city models where it is asked for, and say what was found.
 
     Gives parameters with the shift in metres, and a plan with a note of kind ``model-shifted``. InputError if no

@@ -26,7 +26,7 @@ from pipeline.points_terrain.terrain_fill import (
     coarse_around,
     coarse_terrain,
     coarsen,
-    count_deep,
+    count_coarse,
     fill_terrain,
     flood_terrain,
     merge_coarse,
@@ -408,7 +408,7 @@ def flood_tile(task: Task) -> Facts:
     within = node_window(task.context.bounds, spacing)
     window = grow_window(own, FILL_RINGS, within=within)
     flooded = flood_terrain(join_rasters(task, "ground", window, spacing), own)
-    sums, n_deep = coarsen(flooded), count_deep(flooded)
+    sums, n_deep = coarsen(flooded), count_coarse(flooded)
     task.put(z=flooded.dtm.z, node=sums.node.reshape(-1, 2), total=sums.total, count=sums.count)
     if n_deep:
         task.put(ring=flooded.ring)

@@ -27,10 +27,10 @@ from tiler.citymodels.building_index import (
     BuildingRow,
     Vertices,
     check_indices,
+    copy_vertices,
     has_parts,
     read_building,
     read_objects,
-    spool_vertices,
 )
 from tiler.store.run_folder import WRONG_FIELD
 from tiler.tiles3d.content import Ints, Layer, Surface, join_surfaces
@@ -140,8 +140,8 @@ def read_parts(model: Path, lowest: Mapping[int, float], told: Counter[str]) -> 
     -----
     The file is read twice, an object at a time.
     """
-    with TemporaryFile() as spool:
-        vertices = spool_vertices(model, spool)
+    with TemporaryFile() as vertex_file:
+        vertices = copy_vertices(model, vertex_file)
         for name, thing in read_objects(model):
             if has_parts(model, thing):
                 continue

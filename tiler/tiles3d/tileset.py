@@ -17,13 +17,13 @@ from tiler.store.atomic import replacing, replacing_folder
 from tiler.store.out_folder import CITY_MODEL
 from tiler.tiles3d.base import Base, Made, SortedPiece, open_base
 from tiler.tiles3d.buildings import Part, load_parts, read_parts, write_part
+from tiler.tiles3d.cell_buffers import CellBuffers
 from tiler.tiles3d.cells import Cell, encode
-from tiler.tiles3d.kept import Kept
 from tiler.tiles3d.slices import ROW as SLICE_ROW
 from tiler.tiles3d.slices import cut_pieces, make_slices
-from tiler.tiles3d.spool import Spool
 from tiler.tiles3d.subtrees import TILESET, Tile, Tree, make_tileset, write_tree
 from tiler.tiles3d.terrain import ROW
+from tiler.tiles3d.update_state import UpdateState
 
 READ_AT_ONCE = 1000  # parts of buildings
 
@@ -36,7 +36,7 @@ def export_tileset(
     vertical_crs: str = "",
     slice_height: Sequence[float] = (),
     slice_line: Sequence[str] = (),
-    keep: Kept | None = None,
+    keep: UpdateState | None = None,
 ) -> list[str]:
     """Write a finished run as 3D Tiles 1.1.
 
@@ -50,7 +50,7 @@ def export_tileset(
         See `Globe`.
     slice_height, slice_line
         Where the volume mesh is cut: see `make_slices`.
-    keep : Kept, optional
+    keep : UpdateState, optional
         Takes what an update of the tileset needs, see `tiler.tiles3d.update`.
 
     Returns
@@ -78,7 +78,7 @@ def export_tileset(
     told: Counter[str] = Counter()
     with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".cells.") as name:
         ground, buildings, cut = (
-            Spool(_make_folder(Path(name) / kind)) for kind in ("ground", "buildings", "slices")
+            CellBuffers(_make_folder(Path(name) / kind)) for kind in ("ground", "buildings", "slices")
         )
         found = _sort_ground(base, ground)
         lowest = find_lowest(one.lowest for one in found.values())
@@ -151,15 +151,15 @@ def write_root(folder: Path, tree: Tree, base: Base) -> None:
         part.write_text(json.dumps({"format": "3dtiles", "tiles": tree.tiles}) + "\n")
 
 
-def _sort_ground(base: Base, spool: Spool) -> dict[str, SortedPiece]:
+def _sort_ground(base: Base, buffers: CellBuffers) -> dict[str, SortedPiece]:
     """Sort the ground into cells; gives what else is known of each piece."""
     found = {}
     for k, name in enumerate(base.surface.names):
         piece = base.sort_piece(k)
         for code, rows in piece.ground.items():
-            spool.add(code, rows.tobytes())
+            buffers.add(code, rows.tobytes())
         found[name] = replace(piece, ground={})
-    spool.flush()
+    buffers.flush()
     return found
 
 
@@ -172,12 +172,12 @@ def find_lowest(tiles: Iterable[Mapping[int, float]]) -> dict[int, float]:
     return found
 
 
-def _sort_parts(parts: Iterator[Part], base: Base, spool: Spool) -> dict[str, int]:
+def _sort_parts(parts: Iterator[Part], base: Base, buffers: CellBuffers) -> dict[str, int]:
     """Sort the buildings into cells, each whole, by the middle of its box; gives the cell of each id."""
     places: dict[str, int] = {}
     while waiting := list(islice(parts, READ_AT_ONCE)):
         for part, cell in zip(waiting, base.leaves_of_parts(waiting), strict=True):
-            spool.add(cell, write_part(part))
+            buffers.add(cell, write_part(part))
             places[part.id] = cell
-    spool.flush()
+    buffers.flush()
     return places

@@ -21,11 +21,11 @@ from tiler.store.store import Store
 from tiler.tiles3d.base import Base, Content, Made, SortedPiece, open_base
 from tiler.tiles3d.buildings import Part, read_parts
 from tiler.tiles3d.cells import Cell, decode, encode
-from tiler.tiles3d.kept import MODEL, Kept, RunTile, hash_rows, make_run_tile, read_stamps
 from tiler.tiles3d.slices import ROW as SLICE_ROW
 from tiler.tiles3d.subtrees import SUBTREE_LEVELS, Tile, subtree_path, write_tree
 from tiler.tiles3d.terrain import ROW
 from tiler.tiles3d.tileset import content_path, export_tileset, find_lowest, write_content, write_root
+from tiler.tiles3d.update_state import MODEL, RunTile, UpdateState, hash_rows, make_run_tile, read_stamps
 
 TILES, MADE = "tiles", "made"  # below the folder: the tileset, and what is kept beside it
 SCHEMA = 1  # version of the latter
@@ -61,11 +61,11 @@ def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, 
     base = open_base(files, geoid_height=geoid_height, vertical_crs=vertical_crs)
     state = [SCHEMA, geoid_height, vertical_crs, base.crs, list(base.site.bounds), base.site.tiles.tolist()]
     state += [list(base.surface.names), list(base.surface.ground)]
-    kept = Kept(folder / MADE, state)
+    kept = UpdateState(folder / MADE, state)
     if kept.is_sound():
         return _Update(base, files, kept, folder / TILES).run()
     with replacing_folder(folder) as new:
-        kept = Kept(new / MADE, state)
+        kept = UpdateState(new / MADE, state)
         export_tileset(new / TILES, files, geoid_height=geoid_height, vertical_crs=vertical_crs, keep=kept)
         return len(kept.read_tree())
 
@@ -73,7 +73,7 @@ def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, 
 class _Update:
     """One update."""
 
-    def __init__(self, base: Base, files: RunFiles, kept: Kept, folder: Path) -> None:
+    def __init__(self, base: Base, files: RunFiles, kept: UpdateState, folder: Path) -> None:
         self._base, self._files, self._kept, self._folder = base, files, kept, folder
         self._store = Store(files.directory / STORE)
         self._pieces: dict[str, SortedPiece] = {}  # those that were read

@@ -31,7 +31,7 @@ from tiler.monitoring.run_log import RunLog
 from tiler.monitoring.watchers import Watchers
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
-from tiler.planning.model_shift import settle_shift
+from tiler.planning.model_shift import resolve_shift
 from tiler.planning.own_stages import OwnStages, check_own, run_own_stages
 from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.planning.region import Pad
@@ -67,8 +67,8 @@ from tiler.workflow.other_region import (
     remove_folders,
     remove_if_useless,
 )
+from tiler.workflow.resolved_domain import pad_plan
 from tiler.workflow.run_watchers import LeaseWatch, begin_watching
-from tiler.workflow.settled_domain import pad_plan
 from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import describe_tasks, summarise_run
 
@@ -201,7 +201,7 @@ def _run(
         # changes, its record no longer says that it is done, whatever happens to the power.
         journal = read_journal(out)
         plan = _plan(config, out, say, fresh=config.overwrite or not earlier)
-        given, (config, plan) = config, settle_shift(config, plan, say)
+        given, (config, plan) = config, resolve_shift(config, plan, say)
         untouched = False
         _write_record(out, record, durable=bool(earlier))
         clear_folder(out, earlier, overwrite=config.overwrite)

@@ -12,7 +12,7 @@ from tiler.landcover.canopy_stages import canopy_stages
 from tiler.landcover.cover_stages import cover_stages
 from tiler.landcover.water import LEVELS, known_levels
 from tiler.objects.places import refuse_bucket
-from tiler.planning.model_shift import settle_shift
+from tiler.planning.model_shift import resolve_shift
 from tiler.planning.own_stages import OwnStages
 from tiler.planning.plan import check_sources, make_plan
 from tiler.stages.alignment import shift_of_run
@@ -23,7 +23,7 @@ from tiler.store.folder_lock import only_run
 from tiler.store.out_folder import PIECES, STORE
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.failed_tiles import config_alone
-from tiler.workflow.settled_domain import digest_of, domain_of_run, plan_alone, take_domain
+from tiler.workflow.resolved_domain import digest_of, domain_of_run, plan_alone, take_domain
 from tiler.workflow.stage_sequence import make_engine, run_city_stages
 
 
@@ -53,7 +53,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
     if config.water_points:
         raise ConfigError("--only with --water-points: water at the sides of its part of the region would differ")
     refuse_bucket(config.out, "--only")
-    config, whole = settle_shift(config, make_plan(config, say_nothing), say_nothing)
+    config, whole = resolve_shift(config, make_plan(config, say_nothing), say_nothing)
     domain, tallest = domain_of_run(config)
     shift = shift_of_run(config) if config.align and config.footprints else None
     pad, store = None, None

@@ -34,7 +34,7 @@ from tiler.store.edit_journal import Edits
 from tiler.store.out_folder import STORE
 from tiler.store.store import Store
 from tiler.workflow.failed_tiles import run_whole
-from tiler.workflow.settled_domain import settle_domain
+from tiler.workflow.resolved_domain import resolve_domain
 
 NO_EDITS = Edits()
 MODEL = "model"
@@ -57,7 +57,7 @@ def run_stages(engine: Engine, config: Config, edits: Edits = NO_EDITS, *, forme
     rounds = run_city_stages(engine, config, edits)
     if former is not None:
         engine.changes = _find_changes(engine, Store(former))
-    domain = settle_domain(engine, config)
+    domain = resolve_domain(engine, config)
     # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
     of_model = [fit_stage(config), *city_model_stages(config), *canopy_stages(config)]
     if config.footprints and not config.align:

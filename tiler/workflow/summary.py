@@ -11,7 +11,7 @@ from pipeline.data.notes import Note, count_notes
 from pipeline.points_terrain.terrain_fill import RIM as FAR_NODES
 from pipeline.simplification.house_clusters import add_counts
 from tiler.config.config import Config
-from tiler.config.domain_height import settle
+from tiler.config.domain_height import resolve_height
 from tiler.config.zone_levels import describe_zones
 from tiler.engine.engine import Engine
 from tiler.engine.records import Records
@@ -86,7 +86,7 @@ def summarise_run(
     notes += note_parts(report["parts"])
     notes += describe_feet(record.facts.get("feet", {}) for record in records.of("houses"))
     found = records["domain", REGION_ITEM].facts
-    domain = settle(config.domain_height, config.top, found)
+    domain = resolve_height(config.domain_height, config.top, found)
     outline = _join_outlines([record.facts["outline"] for record in records.of("model")])
     left_out = describe_left_out(engine, notes)
     incomplete = unreadable or missing.tiles or missing.others or INCOMPLETE & {note.kind for note in notes}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.geometry.outlines import deal_out, open_outline
+from pipeline.geometry.outlines import open_outline, points_by_piece
 
 COURT = shapely.Polygon(shapely.box(0, 0, 9, 9).exterior, [shapely.box(3, 3, 6, 6).exterior])
 
@@ -52,7 +52,7 @@ def test_points_are_dealt_out_to_the_piece_that_has_them() -> None:
     xyz = rng.uniform(-1, 10, (300, 3))
     xyz[::7, 0] = 3.0  # on a side of the court, where no piece has them
     pieces = np.array([COURT, shapely.box(3, 3, 6, 6)])
-    for (outline, found), piece in zip(deal_out(pieces, xyz), pieces, strict=True):
+    for (outline, found), piece in zip(points_by_piece(pieces, xyz), pieces, strict=True):
         assert outline.polygon is piece
         assert outline.area == piece.area
         assert found.tolist() == xyz[shapely.contains_xy(piece, *xyz[:, :2].T)].tolist()
@@ -61,5 +61,5 @@ def test_points_are_dealt_out_to_the_piece_that_has_them() -> None:
         shared = outline.with_corners(np.array([[4.0, 3.0]])).polygon
         assert shapely.get_num_coordinates(shared) == shapely.get_num_coordinates(piece) + 1
         assert shapely.equals(shared, piece)
-    ((whole, none),) = deal_out(pieces[:1], xyz[:0])
+    ((whole, none),) = points_by_piece(pieces[:1], xyz[:0])
     assert (whole.n_rings, none.shape) == (2, (0, 3))

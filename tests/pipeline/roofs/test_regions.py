@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.geometry.outlines import deal_out
+from pipeline.geometry.outlines import points_by_piece
 from pipeline.roofs.regions import MIN_NEAR, STEP_REACH, join_cells
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def test_regions_are_those_of_a_plain_way(seed: int, density: float) -> None:
     heights = rng.choice([3.0, 6.0, 6.5, 9.0, 12.0], len(cells))
     xyz = rng.uniform(0, 30, (int(900 * density), 3))
     xyz = xyz[np.argsort(xyz[:, 2], kind="stable")]
-    outlines, dealt = zip(*deal_out(cells, xyz), strict=True)
+    outlines, dealt = zip(*points_by_piece(cells, xyz), strict=True)
     points = [np.column_stack((p[:, :2], h + p[:, 2] / 25)) for p, h in zip(dealt, heights, strict=True)]
     region, within = join_cells(outlines, points, min_step=STEP, min_area=AREA, min_points=POINTS)
     assert region.tolist() == plain(cells, points)
@@ -85,7 +85,7 @@ def test_a_cell_without_points_goes_to_a_neighbour() -> None:
     cells = shapely.box([0, 8, 16], 0, [8, 16, 24], 8)
     xyz = np.column_stack((np.linspace(0.5, 7.5, 40), np.full(40, 4.0), np.full(40, 3.0)))
     there = np.concatenate((xyz, xyz + np.array([16, 0, 9])))
-    outlines, points = zip(*deal_out(cells, there), strict=True)
+    outlines, points = zip(*points_by_piece(cells, there), strict=True)
     assert len(points[1]) == 0
     region, within = join_cells(outlines, points, min_step=STEP, min_area=AREA, min_points=POINTS)
     assert region.tolist() == [0, 0, 2]

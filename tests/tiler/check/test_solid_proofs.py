@@ -16,7 +16,7 @@ from pipeline.data.roofs import Roofs
 from tests.helpers import iso19107
 from tests.helpers.written_models import read_city_model
 from tiler.check.solid_proofs import check_solids
-from tiler.citymodels.building_index import spool_vertices
+from tiler.citymodels.building_index import copy_vertices
 from tiler.citymodels.cityjson import write_city_model
 
 Json = dict[str, Any]
@@ -74,7 +74,7 @@ def prove(folder: Path, model: Json) -> tuple[str, set[str]]:
     file = folder / "b.city.json"
     file.write_text(json.dumps(model))
     with TemporaryFile() as spool:
-        proof = check_solids(file, spool_vertices(file, spool))
+        proof = check_solids(file, copy_vertices(file, spool))
     return proof.claim, {fault.kind for fault in proof.faults}
 
 

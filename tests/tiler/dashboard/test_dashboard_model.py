@@ -10,10 +10,10 @@ import pytest
 
 from pipeline.data.errors import InputError
 from tests.helpers.simulated_runs import simulate, write_events
-from tiler.dashboard.answer import _describe_at_work, _describe_step, tell
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.map_view import MOST_SHOWN, Question, describe_map
 from tiler.dashboard.metrics import families, write_text
+from tiler.dashboard.page_data import _describe_at_work, _describe_step, describe_page
 from tiler.monitoring.items import STATES, State
 from tiler.monitoring.run_state import MOST, TILE, RunState, Series
 from tiler.store.out_folder import EVENTS
@@ -169,7 +169,7 @@ def test_the_file_is_followed_line_by_line_and_begun_anew(tmp_path: Path) -> Non
     path = write_events(tmp_path, simulate(9, done=1.0))
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:20]) + lines[20][:15])
-    follower = Follower(tmp_path, lambda: True)
+    follower = EventReader(tmp_path, lambda: True)
     follower.advance()
     assert (follower.model.version, follower.model.ignored) == (20, 0)
     with path.open("a") as file:
@@ -187,7 +187,7 @@ def test_the_file_is_followed_line_by_line_and_begun_anew(tmp_path: Path) -> Non
 
 def test_reading_a_long_file_is_dealt_out_over_questions(tmp_path: Path) -> None:
     write_events(tmp_path, simulate(4000))
-    follower = Follower(tmp_path, lambda: False)
+    follower = EventReader(tmp_path, lambda: False)
     follower.advance(0.0)
     assert 0 < follower.share < 1
     while follower.share < 1:
@@ -200,7 +200,7 @@ def test_a_run_without_events_is_told_from_its_record(small_run: Path, tmp_path:
     record = json.loads((small_run / "run.json").read_bytes())
     record["missing"] = {"7_7": {"stage": "columns", "name": "7_7", "reason": "why", "command": "do"}}
     (tmp_path / "run.json").write_text(json.dumps(record))
-    answer = tell(Follower(tmp_path), Question(value="cells"))
+    answer = describe_page(EventReader(tmp_path), Question(value="cells"))
     assert answer["head"]["status"] == "done"
     assert answer["map"]["tiles"][State.DONE] == len(record["tiles"]) == 4
     assert sum(row[2] for row in answer["map"]["rows"]) == pytest.approx(record["counts"]["cells"], rel=1e-3)
@@ -209,35 +209,35 @@ def test_a_run_without_events_is_told_from_its_record(small_run: Path, tmp_path:
 
 def test_a_folder_of_nothing_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds neither events\.jsonl nor run\.json"):
-        Follower(tmp_path).advance()
+        EventReader(tmp_path).advance()
     (tmp_path / "run.json").write_text("[]")
     with pytest.raises(InputError, match="is damaged"):
-        Follower(tmp_path).advance()
+        EventReader(tmp_path).advance()
 
 
 def test_a_run_whose_process_is_gone_is_dead(tmp_path: Path) -> None:
     write_events(tmp_path, simulate(4, done=0.5, status="running"))
-    assert tell(Follower(tmp_path), Question())["head"]["status"] == "dead"
-    assert tell(Follower(tmp_path, lambda: True), Question())["head"]["status"] == "running"
+    assert describe_page(EventReader(tmp_path), Question())["head"]["status"] == "dead"
+    assert describe_page(EventReader(tmp_path, lambda: True), Question())["head"]["status"] == "running"
 
 
 def test_what_is_left_follows_from_measured_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the terminal tells it: a stage that nobody has measured counts by its usual part of the work."""
-    monkeypatch.setattr("tiler.dashboard.answer.time.time", lambda: 110.0)
+    monkeypatch.setattr("tiler.dashboard.page_data.time.time", lambda: 110.0)
     (tmp_path / EVENTS).write_text("")
-    follower = Follower(tmp_path, lambda: True)
+    follower = EventReader(tmp_path, lambda: True)
     follower.advance()
     follower.model = begun(
         item("submitted", "houses", "0_0") | {"t": 100.0},
         item("done", "houses", "0_0", seconds=4.0, total=2) | {"t": 104.0},
         item("done", "pieces", "0_0", seconds=2.0, total=2) | {"t": 106.0},
     )
-    head = tell(follower, Question())["head"]
+    head = describe_page(follower, Question())["head"]
     assert head["left"] == pytest.approx((4.0 + 2.0) * 10.0 / 6.0)  # 6 s of work took 10 s
     assert head["share"] == pytest.approx(0.5)
     follower.model.fold({"event": "planned", "stage": "columns", "scope": "tile", "total": 2})
     more = (4.0 + 2.0) * 2 * 0.13 / (0.13 + 0.10)
-    head = tell(follower, Question())["head"]
+    head = describe_page(follower, Question())["head"]
     assert head["left"] == pytest.approx((4.0 + 2.0 + more) * 10.0 / 6.0)
     assert head["share"] == pytest.approx(6.0 / (12.0 + more), abs=1e-4)
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.helpers.simulated_runs import simulate, write_events
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.server import serve
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
@@ -43,7 +43,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder, out = tmp_path_factory.mktemp("run"), tmp_path_factory.mktemp("pictures")
     path = write_events(folder, simulate(N, done=0.5, failed=2, running=3, reused=0.3, status="running"))
     last: dict[str, Any] = {}
-    with serve(Follower(folder, lambda: True)) as url, run_browser("browse.js", url, out) as job:
+    with serve(EventReader(folder, lambda: True)) as url, run_browser("browse.js", url, out) as job:
         assert job.stdout is not None
         for line in job.stdout:
             if line.strip() == "ready":

@@ -20,7 +20,7 @@ from tests.helpers.simulated_runs import simulate, write_events
 from tests.helpers.told import Listener, StageEnds
 from tiler.cli.main import main
 from tiler.config.config import make_config
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.server import read_address, serve
 from tiler.interface.synth import write_city
 from tiler.monitoring.items import State
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def port(folder: Path) -> Iterator[int]:
     """Port of a server of that folder."""
-    with serve(Follower(folder)) as url:
+    with serve(EventReader(folder)) as url:
         assert url.startswith("http://127.0.0.1:")
         assert url.endswith("/citystitch/")
         yield int(url.split(":")[2].split("/")[0])
@@ -127,7 +127,7 @@ def test_metrics_are_at_both_places(port: int) -> None:
 
 def test_a_damaged_folder_is_told_by_the_page_and_fails_a_scrape(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{")
-    with serve(Follower(tmp_path)) as url:
+    with serve(EventReader(tmp_path)) as url:
         number = int(url.split(":")[2].split("/")[0])
         assert "is damaged" in json.loads(ask(number, "/citystitch/api/state")[2])["trouble"]
         assert ask(number, "/metrics")[0] == 503

@@ -19,7 +19,7 @@ from tests.runs.test_tiled_runs import TILE
 from tiler.cli.main import main
 from tiler.config.config import Config, idle_parameters, make_config
 from tiler.config.config_file import load_config
-from tiler.config.domain_height import Domain, read_height, settle
+from tiler.config.domain_height import Domain, read_height, resolve_height
 from tiler.config.step_options import expected_levels
 from tiler.mesh_files.vtk_files import read_vtu
 from tiler.stages.domain import LOW_DOMAIN, layer_stages
@@ -263,6 +263,6 @@ def test_forecasts_count_the_levels_of_growing_layers() -> None:
 
 def test_domains_are_settled_by_what_the_region_holds() -> None:
     facts = {"tallest": 20.5, "highest_ground": 7.25}
-    assert settle("6H", "flat", facts) == Domain(123.0, 130.25)
-    assert settle("6H", "terrain", facts) == Domain(123.0, None)
-    assert settle(50.0, "flat", facts) == Domain(50.0, 57.25)
+    assert resolve_height("6H", "flat", facts) == Domain(123.0, 130.25)
+    assert resolve_height("6H", "terrain", facts) == Domain(123.0, None)
+    assert resolve_height(50.0, "flat", facts) == Domain(50.0, 57.25)

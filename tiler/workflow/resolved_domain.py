@@ -7,7 +7,7 @@ from pathlib import Path
 from pipeline.data.errors import InputError
 from stitch.tiling.grid import Bounds
 from tiler.config.config import Config, check_height
-from tiler.config.domain_height import Domain, settle
+from tiler.config.domain_height import Domain, resolve_height
 from tiler.config.step_options import needs_region
 from tiler.engine.engine import Engine
 from tiler.engine.run_context import make_layout, pack_tiles
@@ -21,7 +21,7 @@ from tiler.store.store import Store
 from tiler.workflow.failed_tiles import as_error, bounds_around, config_alone, run_whole
 
 
-def settle_domain(engine: Engine, config: Config) -> Domain:
+def resolve_domain(engine: Engine, config: Config) -> Domain:
     """Measure the city model, and decide height and top of the domain, which later stages take as parameters.
 
     Parameters
@@ -40,7 +40,7 @@ def settle_domain(engine: Engine, config: Config) -> Domain:
     """
     run_whole(engine, *domain_stages(config))
     found = engine.records["domain", REGION_ITEM].facts
-    domain = settle(config.domain_height, config.top, found)
+    domain = resolve_height(config.domain_height, config.top, found)
     pad = find_pad(engine.context.grid, config, float(found["tallest"])) if config.padded else None
     take_domain(engine, config, domain, pad)
     return domain
@@ -51,7 +51,7 @@ def take_domain(
 ) -> None:
     """Give the stages after the city model the height and top of the domain, and choose the layers that need them.
 
-    Where the region has a pad, the engine goes on over both. Other parameters and errors as for `settle_domain`
+    Where the region has a pad, the engine goes on over both. Other parameters and errors as for `resolve_domain`
     and `lay_pad`.
     """
     check_height(config, domain.height)
@@ -91,7 +91,7 @@ def domain_of_run(config: Config) -> tuple[Domain, float]:
             f"{config.out}: the height of the domain follows from the whole region, and its run has not come that "
             f"far ({error}); run it without --only first"
         ) from None
-    return settle(config.domain_height, config.top, facts), float(facts["tallest"])
+    return resolve_height(config.domain_height, config.top, facts), float(facts["tallest"])
 
 
 def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, rim_store: Path | None = None) -> None:

@@ -61,7 +61,7 @@ class RunTile:
         return {int(number): z for number, z in self.lowest.items()}
 
 
-class Kept:
+class UpdateState:
     """The folder in which that is.
 
     Parameters

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
-from tiler.dashboard.follow import Follower
+from tiler.dashboard.event_reader import EventReader
 from tiler.dashboard.map_view import Question, describe_map
 from tiler.monitoring.items import State
 from tiler.monitoring.run_state import SEAM, TILE, RunState
@@ -24,13 +24,13 @@ TITLES = {  # of the values that come first; a fact has its name
 COUNTED = ("progress", "seconds", "dropped", "notes")  # values that are no facts of stages
 
 
-def tell(follower: Follower, question: Question) -> dict[str, Any]:
+def describe_page(follower: EventReader, question: Question) -> dict[str, Any]:
     """Answer the page: what is new since the version that it has.
 
     Raises
     ------
     InputError
-        As of `Follower.advance`.
+        As of `EventReader.advance`.
     """
     alive = follower.alive()
     with follower.lock:

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 HELD_BYTES = 64 * 2**20  # that wait in memory, of all cells together
 
 
-class Spool:
+class CellBuffers:
     """Bytes by cell in files of a folder: appended in any number of parts, read back whole.
 
     Parameters
     ----------
     folder : Path
-        A folder that exists; its files are those of this spool alone.
+        A folder that exists; its files are those of this buffers alone.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -19,7 +19,7 @@ LONGEST = 2**24  # bytes of a line; a longer one is no event
 PATIENCE = 0.5  # s that one question may spend on reading; the next goes on
 
 
-class Follower:
+class EventReader:
     """The events of a run, read as they are written.
 
     Parameters
