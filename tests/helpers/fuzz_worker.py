@@ -1,6 +1,7 @@
 """The command line in a process apart, one call a line: a crash or a hang of a library ends that process alone."""
 
 import contextlib
+import faulthandler
 import io
 import json
 import os
@@ -10,6 +11,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import TracebackType
 from typing import Any, Self
 
@@ -51,6 +53,7 @@ class Worker:
     def __init__(self, folder: Path, *, limit: float) -> None:
         self.folder, self.limit = folder, limit
         self._process: subprocess.Popen[str] | None = None
+        self._said = TemporaryFile()  # noqa: SIM115  # closed with this
 
     def __enter__(self) -> Self:
         return self
@@ -59,6 +62,7 @@ class Worker:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._end()
+        self._said.close()
 
     def call(self, *arguments: str) -> Outcome:
         """Call the command line; the time that a new process takes to start does not count."""
@@ -72,8 +76,10 @@ class Worker:
         ready, _, _ = select.select([process.stdout], [], [], self.limit)
         seconds = time.monotonic() - begin
         if not ready:
+            self._said.seek(0)
+            where = self._said.read().decode(errors="replace")[-5000:]
             self._end()
-            return Outcome(HUNG, "", f"no answer in {self.limit:g} s", seconds)
+            return Outcome(HUNG, "", f"no answer in {self.limit:g} s\n{where}", seconds)
         answer = process.stdout.readline()
         if not answer:
             code = process.wait()
@@ -84,10 +90,10 @@ class Worker:
     def _start(self) -> "subprocess.Popen[str]":
         places = os.pathsep.join((str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")))
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.helpers.fuzz_worker"],
+            [sys.executable, "-m", "tests.helpers.fuzz_worker", f"{self.limit * 0.9}"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            stderr=self._said,
             text=True,
             cwd=self.folder,
             env=os.environ | {"PYTHONPATH": places, "PYTHONDONTWRITEBYTECODE": "1"},
@@ -111,7 +117,9 @@ def serve() -> None:
 
     print("ready", file=answers, flush=True)
     for line in sys.stdin:
+        faulthandler.dump_traceback_later(float(sys.argv[1]))  # where a call hangs
         print(json.dumps(answer(main, json.loads(line))), file=answers, flush=True)
+        faulthandler.cancel_dump_traceback_later()
 
 
 def answer(main: Any, arguments: list[str]) -> dict[str, Any]:
