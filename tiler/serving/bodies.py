@@ -47,10 +47,10 @@ def read_body(data: bytes) -> dict[str, Any]:
     try:
         found = json.loads(data, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"body: is no JSON ({error}); send an object as docs/edit.md has it") from None
+        raise InputError(f"body: is no JSON ({error}); send an object as docs/serve.md has it") from None
     if wrong := jsonschema.exceptions.best_match(VALIDATOR.iter_errors(found)):
         place = ".".join(map(str, wrong.absolute_path)) or "body"
-        raise InputError(f"{place}: {wrong.message}; see docs/edit.md")
+        raise InputError(f"{place}: {wrong.message}; see docs/serve.md")
     body: dict[str, Any] = found
     given = [name for name in ("footprint", "cityjson") if name in body]
     if len(given) != (body["action"] != "remove"):

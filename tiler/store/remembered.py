@@ -10,7 +10,10 @@ from typing import Any, TypeVar
 from tiler.objects.places import in_bucket
 
 Found = TypeVar("Found")
-_KNOWN: ContextVar[dict[tuple[object, ...], bytes] | None] = ContextVar("known", default=None)
+# By device, inode and what is looked for: size and time of the file, and what was found. A file that takes the
+# inode of one that is gone takes its place here too, so a process keeps no more than there are files.
+Known = dict[tuple[object, ...], tuple[tuple[int, int], bytes]]
+_KNOWN: ContextVar[Known | None] = ContextVar("known", default=None)
 
 
 @contextmanager
@@ -52,11 +55,11 @@ def remember(
     if known is None or in_bucket(path) or not path.is_file():
         return look()
     stat = path.stat()
-    key = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, *what)
-    if key in known:
-        stored: Any = pickle.loads(known[key])
+    key, state = (stat.st_dev, stat.st_ino, *what), (stat.st_size, stat.st_mtime_ns)
+    if key in known and known[key][0] == state:
+        stored: Any = pickle.loads(known[key][1])
         return stored  # type: ignore[no-any-return]
     found = look()
     if kept is None or kept(found):
-        known[key] = pickle.dumps(found)
+        known[key] = state, pickle.dumps(found)
     return found

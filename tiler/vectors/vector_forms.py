@@ -23,13 +23,14 @@ _BEGINNINGS = {
     b"{": "GeoJSON",
     b"\x1e": "GeoJSON sequence",
 }
+# A city model by its first element, or its first type: properties of GeoJSON may hold any.
+_CITY_MODELS = {
+    "CityJSON": re.compile(rb'(?:(?!"type").)*"type"\s*:\s*"CityJSON(?:Feature)?"', re.DOTALL),
+    "CityGML": re.compile(rb"[^{]*?<(?:\w+:)?CityModel[\s>]"),
+}
 # The first block of an OSM extract in protocol buffers, behind its length; and the first element of one in XML,
 # with nothing but the declaration and comments before: no entities, which may expand without end.
 _OSM_BLOCK, _OSM_BLOCK_PLACE = b"\x0a\x09OSMHeader", 4
-_CITY_MODELS = {
-    "CityJSON": re.compile(rb'"type"\s*:\s*"CityJSON(Feature)?"'),
-    "CityGML": re.compile(rb"<(\w+:)?CityModel[\s>]"),
-}
 _OSM_XML = re.compile(rb"(<\?xml[^>]*\?>)?\s*(<!--(?:[^-]|-(?!->))*-->\s*)*<osm[\s>]")
 
 
@@ -48,7 +49,7 @@ def check_form(path: Path) -> None:
         return
     head = read_head(path)
     for name, mark in _CITY_MODELS.items():
-        if mark.search(head):
+        if mark.match(head):
             raise InputError(f"{path}: is a city model ({name}), no vector file; give it as --buildings")
     pointer = next((mark for mark in _POINTERS if mark in head.lower()), None)
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip()

@@ -34,6 +34,7 @@ from tests.helpers.footprint_files import (
 )
 from tests.helpers.footprint_reading import read_footprints
 from tiler.vectors import gdal_features
+from tiler.vectors.vector_forms import check_form
 from tiler.workflow.summary import INCOMPLETE
 
 SMALL = (X, Y + 1, X + 35, Y + 99)  # not all of the files here: they are asked for by their index
@@ -529,6 +530,12 @@ def test_a_city_model_is_told_from_footprints(tmp_path: Path, text: str, name: s
     path.write_text(text)
     with pytest.raises(InputError, match=rf"is a city model \({name}\), no vector file; give it as --buildings"):
         read(path)
+
+
+def test_a_property_makes_no_city_model(tmp_path: Path) -> None:
+    path = tmp_path / "a.geojson"
+    path.write_text('{"type": "FeatureCollection", "note": {"type": "CityJSON", "text": "<CityModel>"}}')
+    check_form(path)
 
 
 # Features that cannot be read
