@@ -5,6 +5,7 @@ import ipaddress
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -120,31 +121,24 @@ def serve_rules(
     host, port = read_address(address)
     app = Application(make_rules(is_loopback(host)), log_function=_silent)
     sockets = bind_sockets(port, host)
-    loop = asyncio.new_event_loop()
-    ready = threading.Event()
+    stopped = asyncio.Event()
+    started: Future[asyncio.AbstractEventLoop] = Future()
 
-    async def begin() -> HTTPServer:
+    async def work() -> None:
         server = HTTPServer(app, max_body_size=most_body)
         server.add_sockets(sockets)
-        ready.set()
-        return server
-
-    def work() -> None:
-        asyncio.set_event_loop(loop)
-        server = loop.run_until_complete(begin())
-        loop.run_forever()
+        started.set_result(asyncio.get_running_loop())
+        await stopped.wait()
         server.stop()
-        loop.run_until_complete(server.close_all_connections())
-        loop.run_until_complete(loop.shutdown_default_executor())
-        loop.close()
+        await server.close_all_connections()
 
-    thread = threading.Thread(target=work, name="dashboard", daemon=True)
+    thread = threading.Thread(target=asyncio.run, args=(work(),), name="dashboard", daemon=True)
     thread.start()
-    ready.wait()
+    loop = started.result()
     try:
         yield _root(host, sockets[0].getsockname()[1])
     finally:
-        loop.call_soon_threadsafe(loop.stop)
+        loop.call_soon_threadsafe(stopped.set)
         thread.join()
 
 

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.parse
 from collections.abc import Iterator
@@ -203,3 +204,15 @@ def test_a_run_shows_its_page_and_its_bytes_stay(tmp_path: Path, small_run: Path
     assert ("dask_scheduler_workers" in metrics[-1]) == (workers > 0)
     for piece in sorted((small_run / "mesh").iterdir()):
         assert (tmp_path / "out" / "mesh" / piece.name).read_bytes() == piece.read_bytes()
+
+
+def test_a_server_that_is_stopped_at_once_ends(folder: Path) -> None:
+    def serve_often() -> None:
+        for _ in range(100):
+            with serve(EventReader(folder)):
+                pass
+
+    serving = threading.Thread(target=serve_often, daemon=True)
+    serving.start()
+    serving.join(60)
+    assert not serving.is_alive()
