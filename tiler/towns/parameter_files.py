@@ -114,7 +114,7 @@ def _rows(values: dict[str, Any], indent: int) -> str:
 
 def _row(key: str, value: Any, indent: int) -> str:
     name = _NAMES.get(key, key)
-    return f"{' ' * indent}<{name}>{escape(value if isinstance(value, str) else repr(value))}</{name}>\n"
+    return f"{' ' * indent}<{name}>{escape(value) if isinstance(value, str) else repr(value)}</{name}>\n"
 
 
 def _house_values(element: Any) -> dict[str, Any]:
