@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipeline.data.errors import CityError
-    from tiler.interface.api import convert_models, mesh, plan, write_city
+    from tiler.interface.api import convert_models, detail_models, generalise_models, mesh, plan, write_city
     from tiler.interface.api import open_folder as open
     from tiler.interface.city_mesh import Building, CityMesh, Picture
     from tiler.interface.plan_view import RunPlan
@@ -26,6 +26,8 @@ __all__ = [
     "Picture",
     "RunPlan",
     "convert_models",
+    "detail_models",
+    "generalise_models",
     "mesh",
     "open",
     "plan",
@@ -42,6 +44,8 @@ _PLACES = {
     "Picture": ("tiler.interface.city_mesh", "Picture"),
     "RunPlan": ("tiler.interface.plan_view", "RunPlan"),
     "convert_models": ("tiler.interface.api", "convert_models"),
+    "detail_models": ("tiler.interface.api", "detail_models"),
+    "generalise_models": ("tiler.interface.api", "generalise_models"),
     "mesh": ("tiler.interface.api", "mesh"),
     "open": ("tiler.interface.api", "open_folder"),
     "plan": ("tiler.interface.api", "plan"),

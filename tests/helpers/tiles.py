@@ -28,7 +28,6 @@ from tiler.engine.executor import Serial
 from tiler.engine.run_context import RunContext, pack_tiles
 from tiler.engine.stage import REGION_ITEM
 from tiler.objects.places import identify
-from tiler.planning.lod_zones import read_zones
 from tiler.planning.plan import Plan, make_plan
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages
@@ -213,7 +212,7 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
         footprints_identity=identify(Path(config.footprints)),
         footprints_frame=dataclasses.astuple(plan.georeference.footprints),
         footprints_shift=(0.0, 0.0),
-        zones=read_zones(config, plan.region),
+        zones=plan.zones,
         generalised_identity="",
     )
     with nullcontext(Serial()) as executor:

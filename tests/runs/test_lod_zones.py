@@ -26,12 +26,17 @@ from tiler.check.zone_proofs import check_zones
 from tiler.citymodels.tables import unpack_buildings
 from tiler.config.config import make_config
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
+from tiler.engine.executor import Serial
 from tiler.pictures.picture_data import load_city, load_levels
+from tiler.planning.forecast import forecast_run
 from tiler.planning.lod_zones import read_zones
+from tiler.planning.own_stages import OwnStages
+from tiler.planning.plan import make_plan
 from tiler.planning.region import Region
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.run_folder import read_run_record
 from tiler.store.store import Store
+from tiler.workflow.stage_sequence import make_engine
 
 SIZE = 84.0  # m, of a tile: the least for cells of 6 m
 WEST, SOUTH = 3786 * SIZE, 76179 * SIZE
@@ -145,6 +150,13 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
     text = (tmp_path / "out" / CITY_MODEL).read_text()
     objects = json.loads(text)["CityObjects"]
     told = {name: row["attributes"] for name, row in objects.items() if "attributes" in row}
+    notes = [
+        note[0]
+        for stage in ("houses", "model")
+        for path in (tmp_path / "out" / STORE / stage).iterdir()
+        for note in Store(tmp_path / "out" / STORE).attributes(stage, path.stem)["notes"]
+    ]
+    assert not any(kind.endswith("-roof-from-attribute") for kind in notes)  # as blocks are of no points
     # The western cell is not at 0A, so that the eastern one is at 0B; what is beyond the focus has one height.
     assert {name for name, row in told.items() if row[LOD] == "0B"} == {"east"}
     np.testing.assert_allclose(told["east"]["height"], 10.0)
@@ -169,6 +181,27 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
         shape_city(values | {"generalised": str(tmp_path / "bare.gpkg")}, tmp_path / "bare")
     with pytest.raises(ConfigError, match=r"level 0A takes blocks .*--generalised"):
         make_config(town | {"lod_zones": zones})
+
+
+def test_a_file_of_zones_is_read_once(town: dict[str, Any], tmp_path: Path) -> None:
+    zones = tmp_path / "zones.geojson"
+    zones.write_text(
+        json.dumps(
+            {
+                "type": "Feature",
+                "crs": {"type": "name", "properties": {"name": CRS}},
+                "properties": {"level": "1.3", "size": 4},
+                "geometry": shapely.geometry.mapping(shapely.box(*BOUNDS)),
+            }
+        )
+    )
+    config = make_config(town | {"lod_zones": [str(zones)], "out": str(tmp_path / "out")})
+    plan = make_plan(config, lambda _: None)
+    zones.unlink()
+    engine = make_engine(config, tmp_path / "out", plan, Serial(), OwnStages())
+    assert [level for level, *_ in engine.parameters.zones] == ["1.3", "2.2"]
+    assert len(engine.parameters.refinements) == 1
+    assert forecast_run(plan, None, config).cells_by_level["1.3"] > 0
 
 
 @pytest.mark.long

@@ -467,15 +467,9 @@ def _convert(options: argparse.Namespace) -> int:
 
 def _generalise(options: argparse.Namespace) -> int:
     from tiler.generalisation.generalise import generalise
-    from tiler.generalisation.options import Asked, Inputs, Landmarks, read_ids
+    from tiler.generalisation.options import read_options
 
-    landmarks = Landmarks(
-        height=options.landmark_height,
-        volume=options.landmark_volume,
-        tag=options.landmark_tag,
-        ids=read_ids(options.landmarks),
-    )
-    asked, inputs = _from_options(Asked, options, landmarks=landmarks), _from_options(Inputs, options)
+    inputs, asked = read_options(vars(options))
     words = {"workers": options.workers, "overwrite": options.overwrite}
     return _tell(generalise(inputs, options.output, asked, **words), options.output)
 

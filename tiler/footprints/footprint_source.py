@@ -106,7 +106,7 @@ def open_source(
     id_name, height_name = find_id_attribute(info, id_attribute), find_attribute(info, height_attribute)
     find_roof_attributes(info, roof_attribute)
     own = horizontal_crs(info.crs)
-    _check_extent(info, own or crs)
+    check_extent(info.path, info.extent, own or crs)
     if frame is None:
         frame = Frame() if own is None else footprint_frame(own, crs, bounds)[0]
     box = box_to_file(frame, bounds)
@@ -254,13 +254,13 @@ def _crs_notes(info: Layer, own: pyproj.CRS | None, crs: pyproj.CRS, frame: Fram
     return []
 
 
-def _check_extent(info: Layer, crs: pyproj.CRS) -> None:
+def check_extent(path: Path, extent: Box | None, crs: pyproj.CRS) -> None:
     """Refuse degrees beyond the pole: GeoJSON without a CRS means degrees, whatever its author meant."""
-    if crs.is_geographic and info.extent is not None and max(abs(v) for v in info.extent) > 360:
+    if crs.is_geographic and extent is not None and max(abs(v) for v in extent) > 360:
         raise InputError(
-            f"{info.path}: states {crs_name(crs)} (degrees), but its coordinates reach "
-            f"{max(info.extent, key=abs):g}; GeoJSON without a CRS means degrees: state the true one, "
-            f'ogr2ogr -a_srs EPSG:<code> mended.gpkg "{info.path}"'
+            f"{path}: states {crs_name(crs)} (degrees), but its coordinates reach "
+            f"{max(extent, key=abs):g}; GeoJSON without a CRS means degrees: state the true one, "
+            f'ogr2ogr -a_srs EPSG:<code> mended.gpkg "{path}"'
         )
 
 

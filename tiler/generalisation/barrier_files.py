@@ -1,22 +1,19 @@
 """Roads, railways, water and other objects of vector files, by batches in the region's CRS."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.errors import InputError
 from tiler.footprints.footprint_source import is_finite
+from tiler.footprints.plan_shapes import open_shapes
 from tiler.generalisation.summary import Told
-from tiler.georeference.crs import horizontal_crs
-from tiler.georeference.footprints import footprint_frame
-from tiler.georeference.frame import Frame, box_to_file, shapes_to_region
-from tiler.objects.places import is_missing
+from tiler.georeference.frame import box_to_file, shapes_to_region
 from tiler.vectors.features import Box
-from tiler.vectors.layers import Layer, describe_layer, scan_layer
+from tiler.vectors.layers import scan_layer
 from tiler.vectors.wkb import parse_wkb
 
 BATCH = 20_000  # features in memory at once
@@ -28,14 +25,14 @@ HINT = (
 
 
 def scan_geometries(
-    path: Path, *, crs: pyproj.CRS, around: Box, bounds: Box | None, told: Told
+    text: str, option: str, *, crs: pyproj.CRS, around: Box, bounds: Box | None, told: Told
 ) -> Iterator[NDArray[np.object_]]:
-    """Read lines and polygons of a vector file with one layer, without Z, in metres: object (n,) each time.
+    """Read lines and polygons of a vector file, without Z, in metres: object (n,) each time.
 
     Parameters
     ----------
-    path, crs
-        The file, and the CRS of the region.
+    text, option, crs
+        As of `open_shapes`.
     around : tuple of 4 floats
         Where the buildings are (m): it tells which reprojection is best.
     bounds : tuple of 4 floats, optional
@@ -48,20 +45,12 @@ def scan_geometries(
     InputError
         If the file cannot be read, or is an extract of OpenStreetMap.
     ConfigError
-        If it has several layers.
+        If it has several layers and none is named.
     """
-    if is_missing(path):
-        raise InputError(f"{path}: no such file; check the path")
-    try:
-        layer = describe_layer(path)
-    except ConfigError as error:  # several layers
-        raise ConfigError(f"{error}; make a file of it: ogr2ogr one.gpkg {path.name} LAYER") from None
+    layer, frame = open_shapes(text, option, crs=crs, box=bounds or around, say=told.say)
+    path = layer.path
     if layer.gdal is not None and layer.gdal.driver == "OSM":
         raise InputError(f"{path}: {HINT.format(path.name)}")
-    own = horizontal_crs(layer.crs)
-    if own is None:
-        told.say(f"{path.name}: states no CRS, taken in that of the buildings")
-    frame = Frame() if own is None else footprint_frame(own, crs, bounds or around)[0]
     box = None if bounds is None else box_to_file(frame, bounds)
     for features in scan_layer(layer, [], box, batch=BATCH):
         geometry, _, broken = parse_wkb(features.wkb)
@@ -79,16 +68,3 @@ def scan_geometries(
             geometry = geometry[~shapely.is_empty(geometry)]
         if len(geometry):
             yield geometry
-
-
-def extent_of(layer: Layer) -> Box:
-    """Read a layer for its extent, in its own CRS; InputError if it has none."""
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for features in scan_layer(layer, [], None, batch=BATCH):
-        limits = shapely.bounds(parse_wkb(features.wkb)[0]).reshape(-1, 4)
-        limits = limits[np.isfinite(limits).all(axis=1)]
-        low = np.minimum(low, limits[:, :2].min(axis=0, initial=np.inf))
-        high = np.maximum(high, limits[:, 2:].max(axis=0, initial=-np.inf))
-    if not np.isfinite([*low, *high]).all():
-        raise InputError(f"{layer.path}: has no feature with a place; give another file")
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -2,27 +2,29 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.errors import ConfigError
+from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
 from tiler.cityinput.faces import ModelBuilding
 from tiler.cityinput.rows import make_rows, mean_roofs
+from tiler.config.zones import BLOCKS, LOD
 from tiler.convert.features import unique_name
 from tiler.convert.inputs import open_source
 from tiler.footprints.building_parts import mend_polygons
 from tiler.footprints.footprint_attributes import find_attribute, find_id_attribute, id_columns, read_ids
 from tiler.footprints.footprint_index import scan_footprints
 from tiler.footprints.footprint_source import open_source as open_footprints
-from tiler.generalisation.barrier_files import extent_of
+from tiler.footprints.plan_shapes import find_extent
 from tiler.generalisation.options import Asked, Inputs, Landmarks
 from tiler.generalisation.summary import Told
 from tiler.georeference.crs import crs_name, horizontal_crs, parse_crs, utm_crs
@@ -94,17 +96,29 @@ def open_buildings(inputs: Inputs, asked: Asked, told: Told) -> Iterator[Source]
             told.say(note)
         flat = horizontal_crs(source.crs)
         assert flat is not None
-        yield Source(flat, _finish(_scan_models(source.buildings(), asked.landmarks, told), inputs, asked, told))
+        batches = _scan_models(inputs.models[0], source.buildings(), asked.landmarks, told)
+        yield Source(flat, _finish(batches, inputs, asked, told))
         told.counts.update(source.told)
 
 
-def _scan_models(buildings: Iterator[ModelBuilding], landmarks: Landmarks, told: Told) -> Iterator[Buildings]:
+def _scan_models(
+    name: Path, buildings: Iterator[ModelBuilding], landmarks: Landmarks, told: Told
+) -> Iterator[Buildings]:
     while batch := list(islice(buildings, BATCH)):
+        if level := next((own[LOD] for one in batch for own in one.attributes.values() if _is_block(own)), ""):
+            raise InputError(
+                f"{name}: has blocks of level {level} among its buildings; give what they stand for: the folder "
+                "of a run without --generalised, or its input"
+            )
         rows, notes = make_rows(batch, Frame(), "auto", Counter())
         _tell(notes, "", told)
         tagged = {one.id for one in batch if _has_tag(one, landmarks.tag)}
         landmark = np.array([name in tagged for name in rows.ids.tolist()], np.bool_)
         yield Buildings(rows.outlines, rows.ids.astype(object), mean_roofs(rows), rows.base, landmark)
+
+
+def _is_block(attributes: Mapping[str, object]) -> bool:
+    return attributes.get(LOD) in BLOCKS
 
 
 def _tell(notes: Sequence[Note], file: str, told: Told) -> None:
@@ -130,7 +144,9 @@ def _open_footprints(inputs: Inputs, asked: Asked, told: Told) -> tuple[pyproj.C
     crs = horizontal_crs(parse_crs(inputs.crs)) if inputs.crs else own
     if crs is None:
         raise ConfigError(f"{path}: states no CRS; give --crs EPSG:NNNN, a metric one")
-    extent = layer.extent or extent_of(layer)
+    extent = find_extent(layer)
+    if extent is None:
+        raise InputError(f"{path}: has no feature with a place; give another file")
     if crs.is_geographic:
         zone = utm_crs(extent, crs)
         if zone is None or inputs.crs:

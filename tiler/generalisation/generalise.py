@@ -30,12 +30,13 @@ from tiler.generalisation.region_cells import Cells, join_cells
 from tiler.generalisation.rows import LEVELS
 from tiler.generalisation.shards import Shards, Tile, by_tile
 from tiler.generalisation.summary import LevelSum, Told, describe_levels, table_lines
-from tiler.generalisation.tile_cells import Work, count_buildings, pair_buildings, part_tile
+from tiler.generalisation.tile_cells import Work, pair_buildings, part_tile, sort_buildings
 from tiler.generalisation.tile_levels import CellList, CellRecord, GroupList, make_cells, make_levels
 from tiler.georeference.crs import box_words, crs_text
 from tiler.store.atomic import replacing
 from tiler.vectors.features import to_objects
 from tiler.vectors.gdal_layer import list_some
+from tiler.vectors.layers import split_layer
 
 MOST_TILES = 1_000_000
 Result = TypeVar("Result")
@@ -109,9 +110,14 @@ def generalise(
         raise ConfigError(f"{output.parent}: no such folder; make it, or give another --output")
     if workers < 0:
         raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
-    given = [*inputs.models, *filter(None, [inputs.footprints]), *inputs.roads, *inputs.railways]
+    lines = [*inputs.roads, *inputs.railways, *inputs.water, *inputs.others]
+    given = [
+        *inputs.models,
+        *filter(None, [inputs.footprints]),
+        *(Path(split_layer(str(one))[0]) for one in lines),
+    ]
     for path in files.all:
-        refuse_output(path, [*given, *inputs.water, *inputs.others], overwrite=overwrite)
+        refuse_output(path, given, overwrite=overwrite)
     told = Told()
     with TemporaryDirectory(prefix="citystitch-") as folder:
         shards = Shards(Path(folder), asked.tile_size)
@@ -129,7 +135,7 @@ def generalise(
                 f"{box_words(rim.bounds)}; is a coordinate wrong? --bounds takes a part, --tile-size larger tiles"
             )
         tiles = [t for t in shards.covered(rim.bounds) if rim.intersects(shapely.box(*shards.box(t)))]
-        cells = _make_cells(tiles, work, each)
+        cells = _make_cells(tiles, work, each, told)
         owners = _make_levels(cells, work, each)
         told.counts["fragments joined to a neighbour"] = cells.fragments
         levels = _write(files, owners, shards, crs, told)
@@ -149,7 +155,7 @@ def _deal_inputs(inputs: Inputs, asked: Asked, shards: Shards, told: Told) -> tu
             hull = _hull(hull, batch.outlines)
             middle = shapely.get_coordinates(shapely.point_on_surface(batch.outlines))
             for tile, rows in by_tile(np.floor(middle / shards.size).astype(np.int64)):
-                shards.append("buildings", tile, batch.take(rows))
+                shards.append("dealt", tile, batch.take(rows))
             told.counts["landmarks"] += int(batch.landmark.sum())
             missing.difference_update(batch.ids.tolist())
         crs = source.crs
@@ -159,15 +165,15 @@ def _deal_inputs(inputs: Inputs, asked: Asked, shards: Shards, told: Told) -> tu
         told.say(f"--landmarks: {len(missing)} of no building: {list_some(sorted(missing))}")
     around = hull.bounds
     read = partial(scan_geometries, crs=crs, around=around, bounds=inputs.bounds, told=told)
-    for paths, is_barrier, cuts in (
-        (inputs.roads, True, True),
-        (inputs.railways, True, False),
-        (inputs.water, True, True),
-        (inputs.others, False, True),
+    for option, is_barrier, cuts in (
+        ("roads", True, True),
+        ("railways", True, False),
+        ("water", True, True),
+        ("others", False, True),
     ):
-        for path in paths:
+        for path in getattr(inputs, option):
             n = 0
-            for geometry in read(path):
+            for geometry in read(str(path), f"--{option}"):
                 n += len(geometry)
                 hull = _hull(hull, geometry)
                 if is_barrier:
@@ -205,17 +211,18 @@ def _deal_others(geometry: NDArray[np.object_], shards: Shards) -> None:
                 shards.append("others", tile, to_objects([own]))
 
 
-def _make_cells(tiles: Sequence[Tile], work: Work, each: Each) -> Cells:
+def _make_cells(tiles: Sequence[Tile], work: Work, each: Each, told: Told) -> Cells:
     shards = work.shards
+    own = shards.tiles("dealt")
+    counts, copies = np.array(list(each(sort_buildings, own))).T
+    told.counts["buildings with the outline of another one, left out"] += int(copies.sum())
     if work.axis:
-        own = shards.tiles("buildings")
-        counts = list(each(count_buildings, own))
         start = dict(zip(own, np.cumsum([0, *counts]).tolist(), strict=False))
         pairs = [np.empty((0, 2), np.int64)]
         for tile, found in zip(own, each(pair_buildings, own), strict=True):
             pairs += [near + np.array([start[tile], start[other]]) for other, near in found]
-        names = join_pairs(sum(counts), np.concatenate(pairs))
-        for tile, n in zip(own, counts, strict=True):
+        names = join_pairs(int(counts.sum()), np.concatenate(pairs))
+        for tile, n in zip(own, counts.tolist(), strict=True):
             shards.append("blocks", tile, names[start[tile] : start[tile] + n])
     return join_cells(dict(zip(tiles, each(part_tile, tiles), strict=True)), work.asked.fragment)
 

@@ -1,9 +1,10 @@
 """What is asked of a generalisation, as the command line has it."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from pipeline.data.errors import ConfigError, InputError
 from tiler.generalisation import HEIGHTS
@@ -92,7 +93,7 @@ class Inputs:
     # CRS of the output, ``""`` for that of the buildings, or the UTM zone where these are in degrees.
     crs: str = ""
     bounds: tuple[float, float, float, float] | None = None  # region (m); by default all there is
-    # Barriers, and other objects that are none.
+    # Barriers, and other objects that are none: ``FILE`` or ``FILE:LAYER`` each.
     roads: Sequence[Path] = ()
     railways: Sequence[Path] = ()
     water: Sequence[Path] = ()
@@ -107,3 +108,18 @@ class Inputs:
         box = self.bounds
         if box is not None and not (all(map(math.isfinite, box)) and box[0] < box[2] and box[1] < box[3]):
             raise ConfigError(f"--bounds {' '.join(f'{v:g}' for v in box)}: expected XMIN < XMAX and YMIN < YMAX")
+
+
+def read_options(given: Mapping[str, Any]) -> tuple[Inputs, Asked]:
+    """Take what is given by the names of `OPTIONS`, others aside; errors as of both."""
+
+    def pick(kind: Any) -> dict[str, Any]:
+        return {one.name: given[one.name] for one in fields(kind) if one.name in given}
+
+    marks = {name.removeprefix("landmark_"): given[name] for name in LANDMARKS if name in given}
+    landmarks = Landmarks(**marks, ids=read_ids(given.get("landmarks", "")))
+    return Inputs(**pick(Inputs)), Asked(**pick(Asked) | {"landmarks": landmarks})
+
+
+LANDMARKS = ("landmark_height", "landmark_volume", "landmark_tag")
+OPTIONS = (*(one.name for kind in (Inputs, Asked) for one in fields(kind)), *LANDMARKS)

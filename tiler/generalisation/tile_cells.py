@@ -1,6 +1,6 @@
 """Pieces of cells of a tile: blocks of buildings where there are no roads, barriers, borders, registration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -37,9 +37,23 @@ class Pieces:
     block: Index
 
 
-def count_buildings(work: Work) -> int:
-    """Count the buildings whose middle lies in a tile."""
-    return len(read_buildings(work.shards, work.tile))
+def sort_buildings(work: Work) -> tuple[int, int]:
+    """Take each outline of a tile once; gives the number of buildings, and that of copies, which are left out.
+
+    The building has the lowest id of its copies and the greatest height, and is a landmark where one of them is.
+    """
+    dealt = join_buildings(work.shards.read("dealt", work.tile))
+    _, outline = np.unique(shapely.to_wkb(shapely.normalize(dealt.outlines)), return_inverse=True)
+    order = np.lexsort((dealt.ids.astype(str), outline.ravel()))
+    start = np.flatnonzero(np.diff(outline.ravel()[order], prepend=-1))
+    once = replace(
+        dealt.take(order[start]),
+        height=np.maximum.reduceat(dealt.height[order], start),
+        ground=np.fmax.reduceat(dealt.ground[order], start),
+        landmark=np.logical_or.reduceat(dealt.landmark[order], start),
+    )
+    work.shards.append("buildings", work.tile, once.take(np.argsort(order[start])))
+    return len(start), len(order) - len(start)
 
 
 def read_buildings(shards: Shards, tile: Tile) -> Buildings:

@@ -1,7 +1,8 @@
 """The Python interface, as `import tiler` gives it: the command line calls the same functions."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -211,9 +212,110 @@ def convert_models(
     from tiler.convert.convert import Asked
     from tiler.convert.convert import convert_models as convert
 
-    paths = [Path(one) for one in ([models] if isinstance(models, (str, Path)) else models)]
     asked = Asked(format, lod, crs, axis_order, tile_size, overwrite)
-    return convert(paths, Path(output), asked)
+    return convert(_paths(models), Path(output), asked)
+
+
+def generalise_models(
+    models: Source | Sequence[Source], output: Source, *, workers: int = 0, overwrite: bool = False, **options: Any
+) -> list[str]:
+    """Make blocks of buildings between streets, in three levels below LoD1: `citystitch generalise`.
+
+    Parameters
+    ----------
+    models : path, or sequence of paths
+        City models, or the folder of a run; ``()`` with `footprints`.
+    output : path
+        GeoPackage to write; its CityJSON and its table of levels go beside it.
+    workers : int
+        Processes; 0 for this one. The bytes are the same.
+    overwrite : bool
+        Whether to replace what is there.
+    **options
+        As of the command: ``footprints="buildings.gpkg"``, ``roads=["roads.gpkg"]``, ``yard_width=40.0``,
+        ``landmark_height=30.0``.
+
+    Returns
+    -------
+    list of str
+        The table of levels, then what was left out, changed or assumed, a line each.
+
+    Raises
+    ------
+    TypeError
+        If an option is unknown.
+    CityError
+        If options do not go together, or a file cannot be read or written.
+
+    Examples
+    --------
+    >>> import tiler
+    >>> tiler.generalise_models("out", "blocks.gpkg", yard_width=40.0)  # doctest: +SKIP
+    """
+    from tiler.generalisation.generalise import generalise
+    from tiler.generalisation.options import OPTIONS, read_options
+
+    _refuse_unknown(options, OPTIONS, "citystitch generalise --help")
+    given = {**options, "models": _paths(models)}
+    given |= {name: _paths(given[name]) for name in ("roads", "railways", "water", "others") if name in given}
+    given |= {"footprints": Path(given["footprints"])} if given.get("footprints") else {}
+    inputs, asked = read_options(given)
+    return generalise(inputs, Path(output), asked, workers=workers, overwrite=overwrite)
+
+
+def detail_models(
+    models: Source | Sequence[Source],
+    output: Source,
+    *,
+    viewpoint: Sequence[float] = (),
+    distance: Sequence[float] = (),
+    keep: Mapping[str, int] | None = None,
+    **options: Any,
+) -> list[str]:
+    """Put windows, doors and balconies on the walls of city models by rules: `citystitch detail`.
+
+    Parameters
+    ----------
+    models, output
+        As for `convert_models`; the file ends with ``.glb``, ``.json`` (CityJSON) or ``.jsonl`` (CityJSONSeq).
+    viewpoint : (x, y, z)
+        Viewpoint in the CRS of the output (m); ``()`` for full detail.
+    distance : (full, reduced)
+        Distances (m) up to which assets are full, and from which on they are flat.
+    keep : mapping of str to int
+        The least share of polygons (per cent) by semantics, such as ``{"door": 40}``.
+    **options
+        As of the command: ``rules="apartments"``, ``facing=90.0``, ``overwrite=True``, and ``lod``, ``crs`` and
+        ``axis_order`` as of `convert_models`.
+
+    Returns
+    -------
+    list of str
+        What must be known of the result, then the table of polygons by criterion, a line each.
+
+    Raises
+    ------
+    TypeError
+        If an option is unknown.
+    CityError
+        If an option or a rule does not fit, or a file cannot be read or written.
+
+    Examples
+    --------
+    >>> import tiler
+    >>> tiler.detail_models("city.city.json", "city.glb", viewpoint=(78640, 457940, 20))  # doctest: +SKIP
+    """
+    from tiler.detail.detail import DetailAsked
+    from tiler.detail.detail import detail_models as detail
+
+    _refuse_unknown(options, [one.name for one in fields(DetailAsked)], "citystitch detail --help")
+    words: dict[str, Any] = {"viewpoint": ",".join(map(str, viewpoint)), "distance": ",".join(map(str, distance))}
+    words["keep"] = ",".join(f"{label}={percent}" for label, percent in (keep or {}).items())
+    return detail(_paths(models), Path(output), DetailAsked(**words, **options))
+
+
+def _paths(several: Source | Sequence[Source]) -> list[Path]:
+    return [Path(one) for one in ([several] if isinstance(several, (str, Path)) else several)]
 
 
 def _check_script(workers: int) -> None:
@@ -240,15 +342,19 @@ def _show(progress: bool) -> dict[str, Any]:
 
 
 def _configure(pointcloud: Source | Sequence[Source], footprints: Source, parameters: Mapping[str, Any]) -> Config:
-    for name in parameters:
-        if name not in PARAMETERS:
-            near = get_close_matches(name, PARAMETERS, 1)
-            hint = f"did you mean {near[0]}?" if near else "citystitch config lists all"
-            raise TypeError(f"unknown parameter {name!r}; {hint}")
+    _refuse_unknown(parameters, PARAMETERS)
     sources = [pointcloud] if isinstance(pointcloud, (str, Path)) else pointcloud
     values = {name: _as_text(value) for name, value in parameters.items()}
     values |= {"footprints": str(footprints)} if footprints else {}
     return make_config(with_file({POSITIONAL: list(map(str, sources)), **values}))
+
+
+def _refuse_unknown(names: Iterable[str], known: Collection[str], command: str = "citystitch config") -> None:
+    for name in names:
+        if name not in known:
+            near = get_close_matches(name, known, 1)
+            hint = f"did you mean {near[0]}?" if near else f"{command} lists all"
+            raise TypeError(f"unknown parameter {name!r}; {hint}")
 
 
 def _as_text(value: Any) -> Any:

@@ -18,7 +18,6 @@ from tiler.config.zone_levels import find_levels
 from tiler.config.zones import LEVELS
 from tiler.engine.stage import Scope
 from tiler.planning.footprint_sample import FootprintSample
-from tiler.planning.lod_zones import read_zones
 from tiler.planning.own_stages import list_stages, stages_of_pad
 from tiler.planning.plan import Survey
 from tiler.planning.refinements import read_refinements
@@ -246,7 +245,8 @@ def _look_up(
         sizes = SizeField(rule, shapely.STRtree(houses))
     else:
         sizes = size_field_around(survey.region.bounds, rule)
-    areas = refined_areas(SimpleNamespace(**vars(config), refinements=read_refinements(config, survey.region)))
+    refinements = read_refinements(config, survey.region, survey.zones)
+    areas = refined_areas(SimpleNamespace(**vars(config), refinements=refinements))
     sizes = replace(sizes, finer=(*areas, *finer_walls(shapely.STRtree(shapely.boundary(houses)), rule)))
     size = local_sizes(sizes, xy, mesh_size=config.mesh_size)
     share = (config.mesh_size / size) ** 2
@@ -265,7 +265,7 @@ def _by_level(
     if found is None:
         return {}
     xy, share = found
-    level = find_levels(read_zones(config, survey.region), xy.reshape(-1, 2)).reshape(share.shape)
+    level = find_levels(survey.zones, xy.reshape(-1, 2)).reshape(share.shape)
     column, row = (loads.index - survey.meshed.first).T
     cells = loads.cells / share.sum(axis=(1, 3))[column, row]
     parts = ((name, (share * (level == k)).sum(axis=(1, 3))[column, row]) for k, name in enumerate(LEVELS))

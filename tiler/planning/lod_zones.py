@@ -1,5 +1,7 @@
 """Zones with a level of detail: circles, and polygons of vector files."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pyproj
 import shapely
@@ -18,10 +20,11 @@ from tiler.vectors.lengths import number_of
 MOST_ZONES = 1000  # every task has them
 
 
-def read_zones(config: Config, region: Region) -> Zones:
+def read_zones(config: Config, region: Region, say: Callable[[str], None] = lambda _: None) -> Zones:
     """Read the zones of a run, in the region's CRS, and the level of the rest; none without zones.
 
-    The finest level first, the rest last; places as they are, wherever they lie.
+    The finest level first, the rest last; places as they are, wherever they lie. `say` is told of files without a
+    CRS.
 
     Raises
     ------
@@ -39,7 +42,7 @@ def read_zones(config: Config, region: Region) -> Zones:
     }
     for name in asked.files:
         crs = pyproj.CRS.from_user_input(region.crs)
-        shapes = scan_shapes(place(name), ["level", "size"], "lod_zones", crs=crs, bounds=region.bounds)
+        shapes = scan_shapes(name, ["level", "size"], "lod_zones", crs=crs, bounds=region.bounds, say=say)
         for subject, geometry, (level, value) in shapes:
             size = number_of(value)
             if np.isnan(size) or level is None or not geometry.area > 0:

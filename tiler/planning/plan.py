@@ -11,6 +11,7 @@ from pipeline.data.notes import Note
 from stitch.tiling.grid import TileGrid, make_grid, tiles_present
 from tiler.cityinput.sources import CLOUD
 from tiler.config.config import Config, idle_parameters
+from tiler.config.zones import Zones
 from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
 from tiler.georeference.crs import boxes_meet, crs_text
@@ -58,6 +59,7 @@ class Survey:
     # The same, and those of the pad where there is one; where its width follows from the tallest building, that of
     # an expected one counts.
     meshed: TileGrid
+    zones: Zones  # of detail, in the region's CRS; none where none are asked for
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
             f"or --tile-size {2 * side}"
         )
     messages += [*describe_overhang(region.bounds, headers_of_tiles(headers)), *idle_parameters(config)]
-    zones = read_zones(config, region)
+    zones = read_zones(config, region, messages.append)
     check_generalised(config, zones)
     messages += describe_absent(zones, region) if zones else []
     messages += describe_pad(region.bounds, with_points) if config.padded else []
@@ -160,7 +162,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
         say(message)
-    return Survey(region, headers, clouds, messages, unreadable, grid, found, foresee_pad(grid, config))
+    return Survey(region, headers, clouds, messages, unreadable, grid, found, foresee_pad(grid, config), zones)
 
 
 def find_georeference(config: Config, headers: Sequence[CloudHeader]) -> Georeference:

@@ -152,8 +152,8 @@ def replace_by_blocks(task: Task, footprints: Footprints) -> tuple[Footprints, i
 
 def _scan(task: Task, layer: str, names: list[str]) -> Iterator[tuple[str, shapely.Geometry, list[object]]]:
     crs = pyproj.CRS.from_user_input(task.context.crs)
-    path, bounds = place(task.parameters.generalised), task.context.bounds
-    return scan_shapes(path, names, OPTION, crs=crs, bounds=bounds, layer=layer)
+    text = f"{task.parameters.generalised}:{layer}"
+    return scan_shapes(text, names, OPTION, crs=crs, bounds=task.context.bounds)
 
 
 def _pack(task: Task, rows: Iterator[Row]) -> Iterator[FootprintBlock]:

@@ -200,7 +200,7 @@ def make_houses(task: Task) -> Facts:
         blocks = task.parameters.get("blocks_given", False)
         roofs = leave_out_points(roofs, find_blocks(own.forms)[0] >= 0) if blocks else roofs
     city = measure_city(cloud, own, terrain, options, building_class=True, roofs=roofs, trace=task.step)
-    task.notes(city.notes)
+    task.notes(_of_buildings(city.notes, own.ids[find_blocks(own.forms)[0] >= 0]))
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
     others = np.isin(city.model.ids, own.ids[unmarked])
     surfaces, feet = None, {}
@@ -235,6 +235,12 @@ def make_houses(task: Task) -> Facts:
     counts = {"buildings before merging": len(houses), **parts, **_count_forms(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
     return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts, **feet}
+
+
+def _of_buildings(notes: Sequence[Note], blocks: NDArray[np.str_]) -> list[Note]:
+    """Leave out that blocks have the height of their attribute: they never have another one."""
+    names = set(blocks.tolist())
+    return [note for note in notes if not (note.kind.endswith("-roof-from-attribute") and note.subject in names)]
 
 
 def find_near_houses(task: Task) -> Facts:
@@ -363,7 +369,8 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     city = raise_buildings(
         gathered.houses, shapes, terrain, options, reserved=reserved, roof_points=roofs, trace=task.step
     )
-    task.notes(city.notes)
+    of_blocks = gathered.houses.ids[gathered.block >= 0]
+    task.notes(_of_buildings(city.notes, city.model.ids[np.isin(city.model.house, of_blocks)]))
     kept = np.zeros(len(shapes), np.bool_)
     kept[city.row] = True
     roofs = keep_roof_points(roofs, kept)

@@ -56,6 +56,18 @@ class Layer:
         return 1 / float(self.crs.axis_info[0].unit_conversion_factor) if self.crs.axis_info else 1.0
 
 
+def split_layer(text: str) -> tuple[str, str]:
+    """Split ``FILE:LAYER`` into both; the layer is ``""`` where none is named, or a file has that name.
+
+    Examples
+    --------
+    >>> split_layer("city.gpkg:roads"), split_layer("s3://bucket/roads.gpkg")
+    (('city.gpkg', 'roads'), ('s3://bucket/roads.gpkg', ''))
+    """
+    path, _, layer = text.rpartition(":")
+    return (path, layer) if path and "/" not in layer and not Path(text).exists() else (text, "")
+
+
 def describe_layer(path: Path, layer: str = "") -> Layer:
     """Describe a layer without reading its features.
 

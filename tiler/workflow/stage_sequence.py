@@ -19,7 +19,6 @@ from tiler.landcover.cover_stages import cover_file_stages, cover_stages
 from tiler.landcover.cover_table import read_table
 from tiler.landcover.water_points import water_point_stages
 from tiler.objects.places import identify, place
-from tiler.planning.lod_zones import read_zones
 from tiler.planning.own_stages import CORE_STAGE, OwnStages
 from tiler.planning.plan import Plan
 from tiler.planning.refinements import read_refinements
@@ -163,8 +162,8 @@ def make_engine(
         footprints_identity=identify(footprints) if footprints else "",
         footprints_frame=dataclasses.astuple(plan.georeference.footprints),
         footprints_shift=(0.0, 0.0),
-        refinements=read_refinements(config, plan.region),
-        zones=read_zones(config, plan.region),
+        refinements=read_refinements(config, plan.region, plan.zones),
+        zones=plan.zones,
         cover_table=tuple(map(dataclasses.astuple, read_table(config))),
         land_cover_identity=tuple(map(identify, map(place, config.land_cover))),
         trees_identity=identify(place(config.trees)) if config.trees else "",

@@ -7,6 +7,7 @@ from typing import Any
 import jsonschema
 import pytest
 
+import tiler
 from tests.conftest import SHARED
 from tests.helpers.iso19107 import check_solids
 from tests.helpers.patch_readers import read_document
@@ -95,6 +96,16 @@ def test_a_viewpoint_keeps_what_is_near_and_faces_it(house: Path) -> None:
     table = house.parent / "table.json"
     seen = ("--viewpoint", "100005,449980,4", "--distance", "30,90", "--facing", "90", "--keep", "door=100")
     path = detail(house, "a.city.jsonl", *seen, "--json", str(table))
+    words: dict[str, Any] = {
+        "viewpoint": (100005, 449980, 4),
+        "distance": (30, 90),
+        "facing": 90.0,
+        "keep": {"door": 100},
+    }
+    other, rules = house.parent / "b.city.jsonl", str(house.parent / "rules.json")
+    lines = tiler.detail_models(house, other, rules=rules, **words)
+    assert other.read_bytes() == path.read_bytes()
+    assert lines[-3].startswith("semantics alone")
     told = json.loads(table.read_text())
     names = [row["model"] for row in told["polygons"]]
     assert names[:5] == ["full model", "frame", "distance alone", "facing alone", "semantics alone"]

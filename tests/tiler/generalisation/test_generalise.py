@@ -13,12 +13,14 @@ import pyogrio
 import pytest
 import shapely
 
+import tiler
 from pipeline.data.errors import CityError
 from tests.conftest import SHARED
 from tests.helpers.iso19107 import check_solids
 from tests.tiler.cityinput.models import house_json, write_json
 from tiler.cli.main import main
 from tiler.cli.parser import GENERALISE_NUMBERS
+from tiler.config.zones import LOD
 from tiler.convert.inputs import open_source
 from tiler.generalisation import HEIGHTS
 from tiler.generalisation.options import Asked
@@ -46,10 +48,13 @@ def town() -> dict[str, tuple[shapely.Polygon, float]]:
     return houses | {"shed": (box(140, 70, 10, 10), 3.0), "tower": (box(72, 5, 10, 8), 50.0)}
 
 
-def write(path: Path, shapes: list[Any], **columns: Any) -> Path:
+def write(
+    path: Path, shapes: list[Any], *, crs: str | None = "EPSG:28992", layer: str = "", **columns: Any
+) -> Path:
     values = [np.array(list(value), float if name == "height" else object) for name, value in columns.items()]
     wkb, kind = shapely.to_wkb(np.array(shapes)), shapes[0].geom_type
-    pyogrio.raw.write(path, wkb, values, list(columns), geometry_type=kind, crs="EPSG:28992")
+    place = {"layer": layer, "append": path.exists()} if layer else {}
+    pyogrio.raw.write(path, wkb, values, list(columns), geometry_type=kind, crs=crs, **place)
     return path
 
 
@@ -230,6 +235,53 @@ def test_city_models_and_volumes_of_blocks(tmp_path: Path) -> None:
     )  # the cell ends at the rails; the pond is a cell of its own, all of it other
     ponds = [row for row in read(out, "cells").values() if row["area"] == 100]
     assert [row["other_area"] for row in ponds] == [100.0]
+
+
+@pytest.mark.filterwarnings("ignore:.crs. was not provided")
+def test_copies_layers_and_files_without_a_crs(
+    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = make(tmp_path / "out.gpkg", files)
+    write_town(tmp_path / "houses.gpkg", {"z": (town()["a00"][0].reverse(), 2.0)} | town())
+    streets = [shapely.LineString(PLACE + line) for line in STREETS]
+    for layer, shapes in (("roads", streets), ("rails", streets[:1])):
+        write(tmp_path / "net.gpkg", shapes, layer=layer)
+    park = write(tmp_path / "bare.gpkg", [box(10, 75, 10, 10)], crs=None)
+    more = ("--roads", f"{tmp_path}/net.gpkg:roads", "--others", str(park))
+    again = make(tmp_path / "again.gpkg", files, *more)
+    assert bytes_of(out)[:2] == bytes_of(again)[:2]  # a copy counts once
+    given: dict[str, Any] = {
+        "footprints": tmp_path / "houses.gpkg",
+        "roads": tmp_path / "roads.gpkg",
+        "others": str(park),
+    }
+    given |= {"landmark_height": 40.0, "landmarks": "gone", "most_area": 5000.0, "tile_size": 100.0}
+    lines = tiler.generalise_models((), tmp_path / "api.gpkg", **given)
+    assert bytes_of(again) == bytes_of(tmp_path / "api.gpkg")
+    assert lines[1].startswith("LoD1")
+    with pytest.raises(TypeError, match="'landmark_hight'; did you mean landmark_height"):
+        tiler.generalise_models((), tmp_path / "no.gpkg", landmark_hight=40.0)
+    told = json.loads(again.with_suffix(".levels.json").read_text())
+    assert told["counts"]["buildings with the outline of another one, left out"] == 1
+    assert "bare.gpkg: states no CRS, taken as EPSG:28992" in told["notes"]
+    (tmp_path / "bare.geojson").write_text(
+        '{"type": "Feature", "properties": {}, "geometry": ' + shapely.to_geojson(box(10, 75, 10, 10)) + "}"
+    )
+    model = house_json()
+    for thing in model["CityObjects"].values():
+        thing["attributes"] = {LOD: "0B"}
+    blocks = write_json(tmp_path / "blocks.city.json", model)
+    for words, message in (
+        (
+            (*files, "--roads", str(tmp_path / "net.gpkg")),
+            "has 2 layers; name one of them: roads, rails; write --roa",
+        ),
+        ((*files, "--roads", f"{tmp_path}/net.gpkg:x"), "has no layer 'x'"),
+        ((*files, "--others", str(tmp_path / "bare.geojson")), "GeoJSON without a CRS means degrees"),
+        ((str(blocks),), "has blocks of level 0B among its buildings"),
+    ):
+        assert main(["generalise", *words, "-o", str(tmp_path / "no.gpkg")]) in (1, 2)
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.long

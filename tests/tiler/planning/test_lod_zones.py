@@ -20,12 +20,16 @@ REGION = Region((318_000.0, 6_399_000.0, 319_000.0, 6_400_000.0), "EPSG:3006", 1
 X, Y = 318_500.0, 6_399_500.0
 
 
-def write_zones(path: Path, levels: list[Any], sizes: list[Any], *, crs: str = "EPSG:3006") -> None:
+def write_zones(
+    path: Path, levels: list[Any], sizes: list[Any], *, crs: str | None = "EPSG:3006", layer: str = "zones"
+) -> None:
     """Squares of 100, 200, ... m around one place."""
     shapes = [shapely.box(X - side, Y - side, X + side, Y + side) for side in 50.0 * np.arange(1, len(levels) + 1)]
     data = [np.array(levels, object), np.array(sizes, object)]
     wkb = np.array(shapely.to_wkb(shapes), object)
-    pyogrio.raw.write(path, wkb, data, ["level", "size"], geometry_type="Polygon", crs=crs)
+    pyogrio.raw.write(
+        path, wkb, data, ["level", "size"], geometry_type="Polygon", crs=crs, layer=layer, append=path.exists()
+    )
 
 
 def test_the_finest_zone_of_a_place_counts(tmp_path: Path) -> None:
@@ -37,7 +41,7 @@ def test_the_finest_zone_of_a_place_counts(tmp_path: Path) -> None:
     assert [zone[:2] for zone in zones] == [("2.2", 8.0), ("1.3", 5.0), ("1.2", 10.0), ("1.2", 20.0)]
     places = X + np.array([0.0, 75, 120, 400]), np.full(4, Y)
     assert [LEVELS[k] for k in find_levels(zones, np.column_stack(places))] == ["2.2", "2.2", "1.2", "1.2"]
-    assert [size for size, _ in read_refinements(config, REGION)] == [5.0, 8.0, 10.0]
+    assert [size for size, _ in read_refinements(config, REGION, zones)] == [5.0, 8.0, 10.0]
     assert read_described(describe_zones(zones)) == zones
     assert read_zones(Config(), REGION) == ()
     assert (config.zoned, config.finest_size, make_config({"focus": "1,2,3"}).finest_size) == (True, 10.0, 2.5)
@@ -63,6 +67,18 @@ def test_the_finest_zone_of_a_place_counts(tmp_path: Path) -> None:
 def test_wrong_zones_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_config(values)
+
+
+@pytest.mark.filterwarnings("ignore:.crs. was not provided")
+def test_a_layer_of_a_file_without_a_crs_is_told(tmp_path: Path) -> None:
+    for layer, level in (("focus", "2.2"), ("rest", "1.2")):
+        write_zones(tmp_path / "zones.gpkg", [level], ["5"], crs=None, layer=layer)
+    told: list[str] = []
+    config = make_config({"lod_zones": [f"{tmp_path}/zones.gpkg:rest"]})
+    assert [level for level, *_ in read_zones(config, REGION, told.append)] == ["1.2", "2.2"]
+    assert told == ["zones.gpkg: states no CRS, taken as EPSG:3006"]
+    with pytest.raises(ConfigError, match=r"has 2 layers.* write lod_zones = .*zones.gpkg:LAYER"):
+        read_zones(make_config({"lod_zones": [f"{tmp_path}/zones.gpkg"]}), REGION)
 
 
 def test_zones_outside_of_the_region_are_told(tmp_path: Path) -> None:

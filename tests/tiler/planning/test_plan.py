@@ -85,7 +85,7 @@ def country(n: int, size: float = 1000.0) -> Survey:
         if not n // 3 <= 5 * i < 2 * n // 3 or not n // 3 <= 5 * j < 2 * n // 3
     ]
     grid = choose_tiles(make_grid(bounds, tile_size=size, mesh_size=5.0), [cloud.bounds[:4] for cloud in clouds])
-    return Survey(Region(bounds, CRS, size), clouds, clouds, [], {}, grid, ESTABLISHED, grid)
+    return Survey(Region(bounds, CRS, size), clouds, clouds, [], {}, grid, ESTABLISHED, grid, ())
 
 
 def test_cells_points_disk_and_memory_are_as_a_run_has_them(city: Config, record: dict[str, Any]) -> None:
