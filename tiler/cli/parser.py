@@ -553,8 +553,14 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     given: dict[str, dict[str, Any]] = {
         "parts": {"type": int, "metavar": "N", "help": "decompose the mesh for N processes"},
         "cells": {
-            "choices": ("prism",),
-            "help": "prisms of a layered mesh instead of tetrahedra, a third as many",
+            "choices": ("prism", "hybrid"),
+            "help": "prisms of a layered mesh instead of tetrahedra, a third as many; hybrid: prisms near ground "
+            "and roofs of any mesh",
+        },
+        "prism_layers": {
+            "type": int,
+            "metavar": "N",
+            "help": "of a hybrid mesh, how many prisms stand on the ground and on roofs (default: 10)",
         },
         "case": {"choices": ("wind",), "help": "add the files of a simulation"},
         "direction": {

@@ -27,7 +27,7 @@ from tiler.mesh_files.run_files import (
 
 EXPORT_RECORD = "export.json"  # in every folder that was exported: only such a one is ever replaced
 LARGEST_PART = "largest_part"  # taken by every format of the mesh, not by those of the city model
-CELLS = "cells"  # what cells are: tetrahedra, or prisms
+CELLS = ("cells", "prism_layers")  # what cells are: tetrahedra, prisms, or both
 ORIGIN = "origin"  # taken by all of these but glb, which has its own
 PER_BUILDING = ("buildings", LARGEST_PART, ORIGIN)
 

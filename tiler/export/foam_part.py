@@ -406,7 +406,8 @@ class _PartWriter:
             self._lowest[name] = min(self._lowest.get(name, np.inf), float(height.min()))
             self._highest[name] = max(self._highest.get(name, -np.inf), float(height.max()))
             if patch.kind == "wall":
-                near = count_distances(piece.points, piece.cells[faces.facet_cell[chosen]], facets[chosen])
+                centres = piece.points[piece.cells[faces.facet_cell[chosen]]].mean(axis=1)
+                near = count_distances(centres, piece.points, facets[chosen])
                 self._near[name] = self._near.get(name, 0) + near
         if self._zones is not None:
             self._zones.write(k, np.where(mine, self._plan.zone_keys(piece)[outer], -1), face)
@@ -430,22 +431,22 @@ class _PartWriter:
                 height[other[order] == beyond].tofile(place)
 
 
-def count_distances(points: NDArray[np.float64], cells: NDArray[Any], facets: NDArray[Any]) -> Ints:
-    """Count how far centres of cells (k, 4 or 6) are from planes of their facets (k, 3 or 4): bins of `DISTANCES`.
+def count_distances(centres: NDArray[np.float64], points: NDArray[np.float64], facets: NDArray[Any]) -> Ints:
+    """Count how far centres of cells (k, 3) are from planes of their facets (k, 3 or 4): bins of `DISTANCES`.
 
     Examples
     --------
     A cell of 4 m over the ground has its centre 1 m above it:
 
     >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 4]])
-    >>> counts = count_distances(points, np.array([[0, 1, 2, 3]]), np.array([[0, 2, 1]]))
+    >>> counts = count_distances(points.mean(axis=0, keepdims=True), points, np.array([[0, 2, 1]]))
     >>> bool(DISTANCES[counts.argmax() - 1] <= 1.0 <= DISTANCES[counts.argmax()])
     True
     """
     a, b, c = (points[facets[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     area = np.sqrt((normal**2).sum(axis=1))
-    offset = points[cells].mean(axis=1) - a
+    offset = centres - a
     distance = np.abs((offset * normal).sum(axis=1)) / area
     return np.bincount(np.searchsorted(DISTANCES, distance), minlength=len(DISTANCES) + 1)
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
-from tiler.export.export import CELLS as CELL_KIND
+from tiler.export.export import CELLS as CELL_KINDS
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces, blocks_of
@@ -27,10 +27,12 @@ from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
-ELEMENTS = {3: 5, 4: 10, 6: 14}  # TRI_3, TETRA_4 and PENTA_6 among CGNS's types of elements, by corners
-QUADRILATERAL = 7  # QUAD_4
+# CGNS's types of elements by corners: TRI_3 and QUAD_4, TETRA_4, PYRA_5 and PENTA_6.
+FACETS = {3: 5, 4: 7}
+SOLIDS = {4: 10, 5: 12, 6: 14}
 QUADRILATERALS = "_quadrilaterals"  # behind the name of a patch, in that of their section
 BASE, ZONE, CELLS = "city", "air", "cells"
+OTHERS = {4: "tetrahedra", 5: "pyramids"}  # sections of cells behind that of prisms
 Ints = NDArray[np.int64]
 INT32_LIMIT = 2**31 - 1
 NAME_BYTES, TYPE_BYTES = 33, 3  # of attributes and the strings at the root, their last byte zero
@@ -44,20 +46,38 @@ class _Survey:
     """After reading all pieces once: cells, and facets by key of patch, ascending, then by corners."""
 
     n_points: int
-    n_cells: int
+    cells: dict[int, int]  # by corners
     facets: dict[int, dict[int, int]]
     ground: tuple[str, ...]  # names of its patches
-    width: int = 4  # corners of a cell
+
+    @property
+    def n_cells(self) -> int:
+        """Number of all cells."""
+        return sum(self.cells.values())
+
+    @property
+    def sections(self) -> dict[int, str]:
+        """Name of the section of cells with so many corners, in their order."""
+        return {width: OTHERS[width] if k else CELLS for k, width in enumerate(self.cells)}
 
     @property
     def integer(self) -> str:
         """Type of all numbers of points and elements: 64 bits only where a length does not fit in 32."""
         n_elements = self.n_cells + sum(sum(counts.values()) for counts in self.facets.values())
-        return "i4" if max(self.n_points, n_elements, self.width * self.n_cells) <= INT32_LIMIT else "i8"
+        return (
+            "i4"
+            if max(self.n_points, n_elements, *(width * n for width, n in self.cells.items())) <= INT32_LIMIT
+            else "i8"
+        )
 
 
 def export_cgns(
-    output: Path, source: RunSource, *, buildings: str | None = None, cells: str | None = None
+    output: Path,
+    source: RunSource,
+    *,
+    buildings: str | None = None,
+    cells: str | None = None,
+    prism_layers: int | None = None,
 ) -> None:
     """Write the mesh of a finished run as CGNS.
 
@@ -69,8 +89,8 @@ def export_cgns(
         Folder of the run.
     buildings : {"patches"}, optional
         See `write_cgns`.
-    cells : {"prism"}, optional
-        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms`, also for memory.
+    cells, prism_layers
+        See `tiler.mesh_files.prisms.read_prisms`, also for memory; tetrahedra by default.
 
     Raises
     ------
@@ -86,14 +106,15 @@ def export_cgns(
     if origin := pieces.files.origin_words:
         crs += f"; coordinates count from {origin} m"
     with replacing(output) as part, disk_errors(output):
-        if cells == "prism":
-            _write_prisms(part, read_prisms(pieces), crs, by_building=buildings is not None)
+        if cells is not None:
+            mesh = read_prisms(pieces, cells, prism_layers)
+            _write_prisms(part, mesh, crs, by_building=buildings is not None)
         else:
             write_cgns(part, pieces, crs=crs, buildings=buildings)
 
 
 def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -> None:
-    """Write prisms; a patch may have two sections, triangles and quadrilaterals, one behind the other."""
+    """Write prisms and others, a section each; a patch may have two, of triangles and quadrilaterals."""
     facets: dict[int, dict[int, Ints]] = {}
     for width in (3, 4):
         corners, marker, building = mesh.facets(width)
@@ -101,12 +122,15 @@ def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -
         for key, rows in facets_by_key(np.unique(keys).tolist(), keys):
             facets.setdefault(key, {})[width] = corners[rows]
     counts = {key: {width: len(rows) for width, rows in facets[key].items()} for key in sorted(facets)}
-    survey = _Survey(len(mesh.points), len(mesh.cells), counts, mesh.ground, width=6)
+    kinds = mesh.by_width()
+    survey = _Survey(len(mesh.points), {width: len(rows) for width, rows in kinds}, counts, mesh.ground)
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
         zone = _write_tree(file, survey, crs)
         for axis, name in enumerate("XYZ"):
             zone[f"GridCoordinates/Coordinate{name}/ data"][:] = mesh.points[:, axis]
-        zone[f"{CELLS}/ElementConnectivity/ data"][:] = mesh.cells.ravel() + 1
+        for width, rows in kinds:
+            data = zone[f"{survey.sections[width]}/ElementConnectivity/ data"]
+            data[:] = mesh.cells[rows, :width].ravel() + 1
         for key, parts in facets.items():
             for width, rows in parts.items():
                 zone[f"{_section(patch_of_key(key, mesh.ground), width)}/ElementConnectivity/ data"][:] = (
@@ -168,7 +192,9 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
         )
         for key, n in zip(keys.tolist(), counts.tolist(), strict=True):
             facets[key] = facets.get(key, 0) + n
-    return _Survey(pieces.n_points, n_cells, {key: {3: n} for key, n in sorted(facets.items())}, pieces.ground)
+    return _Survey(
+        pieces.n_points, {4: n_cells}, {key: {3: n} for key, n in sorted(facets.items())}, pieces.ground
+    )
 
 
 def _section(patch: Patch, width: int) -> str:
@@ -198,13 +224,15 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
     for axis in "XYZ":
         coordinate = _array(grid, f"Coordinate{axis}", survey.n_points, "f8")
         _node(coordinate, "DimensionalExponents", "DimensionalExponents_t", np.array(LENGTH, "<f4"))
-    _write_section(zone, CELLS, survey.width, 1, survey.n_cells, kind)
+    first = 1
+    for width, n in survey.cells.items():
+        _write_section(zone, survey.sections[width], (SOLIDS[width], width), first, n, kind)
+        first += n
     conditions = _node(zone, "ZoneBC", "ZoneBC_t") if patches else None
-    first = survey.n_cells + 1
     for key, patch in patches.items():
         begin = first
         for width, n in survey.facets[key].items():
-            _write_section(zone, _section(patch, width), width, first, n, kind)
+            _write_section(zone, _section(patch, width), (FACETS[width], width), first, n, kind)
             first += n
         condition = _node(conditions, patch.name, "BC_t", "FamilySpecified")
         _node(condition, "PointRange", "IndexRange_t", np.array([[begin], [first - 1]], f"<{kind}"))
@@ -218,9 +246,11 @@ def _write_family(base: h5py.Group, patch: Patch) -> None:
     _node(family, "FamilyBC", "FamilyBC_t", "BCWall" if patch.kind == "wall" else "UserDefined")
 
 
-def _write_section(zone: h5py.Group, name: str, width: int, first: int, n: int, kind: str) -> None:
-    """Write a section of `n` elements with `width` corners: facets with 4 are told from cells by their name."""
-    element = QUADRILATERAL if width == 4 and name != CELLS else ELEMENTS[width]
+def _write_section(
+    zone: h5py.Group, name: str, element_width: tuple[int, int], first: int, n: int, kind: str
+) -> None:
+    """Write a section of `n` elements of a type and with so many corners."""
+    element, width = element_width
     section = _node(zone, name, "Elements_t", np.array([element, 0], "<i4"))
     _node(section, "ElementRange", "IndexRange_t", np.array([first, first + n - 1], f"<{kind}"))
     _array(section, "ElementConnectivity", n * width, kind)
@@ -263,5 +293,5 @@ def _characters(text: str) -> NDArray[np.int8]:
 
 
 FORMAT = Format(
-    "mesh and named patches as CGNS in HDF5", export_cgns, options=(*PER_BUILDING, CELL_KIND), suffix=".cgns"
+    "mesh and named patches as CGNS in HDF5", export_cgns, options=(*PER_BUILDING, *CELL_KINDS), suffix=".cgns"
 )

@@ -30,7 +30,8 @@ NAMES = {number: region.name.lower() for region, number in VOLUMES.items()}
 NOT_OF_AIR = (Marker.BOTTOM, Marker.FOUNDATION)
 NOT_OF_SOIL = (Marker.WALL, Marker.ROOF, Marker.TOP)
 OF_BUILDING = (Marker.WALL, Marker.ROOF, Marker.MISSING, Marker.FOUNDATION)
-TRIANGLE, QUADRILATERAL, TETRAHEDRON, PRISM = 2, 3, 4, 6  # Gmsh's types of elements
+TRIANGLE, QUADRILATERAL, TETRAHEDRON = 2, 3, 4  # Gmsh's types of elements
+SOLIDS = {4: TETRAHEDRON, 5: 7, 6: 6}  # those of cells, by their corners: pyramids and prisms, too
 TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
 
 _Box = NDArray[np.float64]
@@ -68,7 +69,14 @@ class _Survey:
         }
 
 
-def export_msh(output: Path, source: RunSource, *, buildings: str | None = None, cells: str | None = None) -> None:
+def export_msh(
+    output: Path,
+    source: RunSource,
+    *,
+    buildings: str | None = None,
+    cells: str | None = None,
+    prism_layers: int | None = None,
+) -> None:
     """Write the mesh of a finished run as MSH 4.1, binary.
 
     Parameters
@@ -79,6 +87,8 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None,
         Folder of the run.
     buildings : {"patches"}, optional
         Give each building, walls and roofs, a physical group of its own instead of the two.
+    cells, prism_layers
+        See `tiler.mesh_files.prisms.read_prisms`, also for memory; tetrahedra by default.
 
     Raises
     ------
@@ -94,8 +104,9 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None,
     """
     pieces = open_pieces(source)
     by_building = buildings is not None
-    if cells == "prism":
-        _export_prisms(output, read_prisms(pieces), pieces.files.origin_words, by_building=by_building)
+    if cells is not None:
+        mesh = read_prisms(pieces, cells, prism_layers)
+        _export_prisms(output, mesh, pieces.files.origin_words, by_building=by_building)
         return
     survey = _survey(pieces, by_building=by_building)
     with replacing(output) as part, part.open("wb") as file:
@@ -125,7 +136,7 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None,
 
 
 def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: bool) -> None:
-    """Write prisms; a surface may have two blocks of elements, triangles and quadrilaterals."""
+    """Write prisms and others; a surface may have two blocks of elements, and the volume one a kind of cells."""
     blocks: list[tuple[int, int, Ints]] = []
     counts: dict[int, int] = {}
     boxes: dict[int, _Box] = {AIR: _grown(_no_box(), mesh.points)}
@@ -136,6 +147,7 @@ def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: b
             blocks.append((key, kind, corners[rows]))
             counts[key] = counts.get(key, 0) + len(rows)
             boxes[key] = _grown(boxes.get(key, _no_box()), mesh.points[corners[rows].ravel()])
+    blocks += [(AIR, SOLIDS[width], mesh.cells[rows, :width]) for width, rows in mesh.by_width()]
     survey = _Survey(len(mesh.points), {AIR: len(mesh.cells)}, dict(sorted(counts.items())), boxes, mesh.ground)
     numbers = survey.numbers | {AIR: AIR}
     with replacing(output) as part, part.open("wb") as file:
@@ -146,10 +158,10 @@ def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: b
         file.write(np.ascontiguousarray(mesh.points, "<f8").data)
         file.seek(0, 2)
         n = survey.n_elements
-        file.write(b"$Elements\n" + _packed("u8", [len(blocks) + 1, n, 1, n]))
+        file.write(b"$Elements\n" + _packed("u8", [len(blocks), n, 1, n]))
         tag = 1
-        for key, kind, corners in [*blocks, (AIR, PRISM, mesh.cells)]:
-            file.write(_packed("i4", [3 if kind == PRISM else 2, numbers[key], kind]))
+        for key, kind, corners in blocks:
+            file.write(_packed("i4", [2 if kind in (TRIANGLE, QUADRILATERAL) else 3, numbers[key], kind]))
             file.write(_packed("u8", [len(corners)]))
             tags = tag + np.arange(len(corners))
             file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
@@ -304,4 +316,4 @@ def _numbered(tag: int, nodes: NDArray[np.int64], kind: int, group: NDArray[np.i
     return np.column_stack((tag + np.arange(n), np.full(n, kind), np.full(n, 2), group, group, nodes))
 
 
-FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=(*PER_BUILDING, CELLS), suffix=".msh")
+FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=(*PER_BUILDING, *CELLS), suffix=".msh")

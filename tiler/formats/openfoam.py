@@ -48,6 +48,7 @@ def export_openfoam(
     case: str | None = None,
     buildings: str | None = None,
     cells: str | None = None,
+    prism_layers: int | None = None,
     **wind: Unpack[WindWords],
 ) -> list[str]:
     """Write a case folder of OpenFOAM from a finished run.
@@ -62,8 +63,10 @@ def export_openfoam(
         See `write_openfoam`.
     case : {"wind"}, optional
         Add the files of a simulation.
-    cells : {"prism"}, optional
-        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms`.
+    cells : {"prism", "hybrid"}, optional
+        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms.read_prisms`, also for memory.
+    prism_layers : int, optional
+        Of a hybrid mesh.
     **wind
         See `tiler.export.wind_profile.Wind`.
 
@@ -75,9 +78,9 @@ def export_openfoam(
     Raises
     ------
     ConfigError
-        If there are too few columns for so many parts, or prisms are to be in parts or zones, no side for the wind
-        to come from, soil or cells in buildings where it should blow, or a mesh of several parts that share no
-        face.
+        If there are too few columns for so many parts, or buildings of prisms are to be zones, no side for the
+        wind to come from, soil or cells in buildings where it should blow, or a mesh of several parts that share
+        no face.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -86,9 +89,8 @@ def export_openfoam(
     if case is None and wind:
         raise ConfigError(f"--{min(wind).replace('_', '-')}: is for --case wind; give that too")
     blowing = make_wind(wind)
-    if cells == "prism" and (parts is not None or buildings == "zones"):
-        option = "--buildings zones" if parts is None else "--parts"
-        raise ConfigError(f"{option}: not with --cells prism; leave one out, and divide the case by decomposePar")
+    if cells is not None and buildings == "zones":
+        raise ConfigError(f"--buildings zones: not with --cells {cells}; leave one out, or take patches")
     pieces = open_pieces(source)
     solids = Region.BUILDING in pieces.files.regions
     if case is not None and pieces.files.depth:
@@ -106,9 +108,10 @@ def export_openfoam(
         raise _refuse_parts(case, pieces.files)
     with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".heights.") as name:
         heights = None if case is None else Path(name)
-        if cells == "prism":
-            prisms = read_prisms(pieces)
-            counts = [write_foam_prisms(folder, prisms, by_building=buildings == "patches", heights=heights)]
+        if cells is not None:
+            prisms = read_prisms(pieces, cells, prism_layers, polyhedra=True)
+            by_building = buildings == "patches"
+            counts = write_foam_prisms(folder, prisms, by_building=by_building, heights=heights, parts=parts)
         else:
             counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings, heights=heights)
         notes = []
@@ -292,7 +295,7 @@ def _by_volume(piece: MeshPiece) -> Ints:
 FORMAT = Format(
     "a case folder of OpenFOAM",
     export_openfoam,
-    options=("parts", "case", *WIND_OPTIONS, "buildings", CELLS, LARGEST_PART, ORIGIN),
+    options=("parts", "case", *WIND_OPTIONS, "buildings", *CELLS, LARGEST_PART, ORIGIN),
     buildings=("patches", "zones"),
     folder=True,
 )

@@ -2,7 +2,8 @@
 
 The first grid, ``mesh``, has the tetrahedra, the second, ``facets``, the boundary's triangles with ``marker`` and
 ``building``: what `XDMFFile.read_mesh` and `read_meshtags` of DOLFINx take. With soil or cells in buildings,
-``mesh`` has ``region``. With prisms a third one, ``sides``, has the boundary's quadrilaterals.
+``mesh`` has ``region``. With prisms a third one, ``sides``, has the boundary's quadrilaterals. Cells
+of several kinds are one ``Mixed`` topology.
 """
 
 from pathlib import Path
@@ -17,6 +18,7 @@ from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource
+from tiler.mesh_files.transitions import NO_CORNER
 from tiler.store.atomic import disk_errors, replacing
 from tiler.store.run_folder import LEAVES
 
@@ -32,12 +34,15 @@ ARRAYS = {
 }
 HEAD = '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
 TOPOLOGIES = {4: "Tetrahedron", 6: "Wedge"}  # of cells, by their corners
+MIXED = np.array([0, 0, 0, 0, 6, 7, 8])  # XDMF's numbers of tetrahedra, pyramids and wedges, by corners
 SIDES = "sides"  # quadrilaterals of the boundary
 Rows = dict[str, tuple[int, int]]  # rows and columns of each data set
 TAIL = "  </Domain>\n</Xdmf>\n"
 
 
-def export_xdmf(output: Path, source: RunSource, *, cells: str | None = None) -> None:
+def export_xdmf(
+    output: Path, source: RunSource, *, cells: str | None = None, prism_layers: int | None = None
+) -> None:
     """Write the mesh of a finished run as XDMF.
 
     Parameters
@@ -46,8 +51,8 @@ def export_xdmf(output: Path, source: RunSource, *, cells: str | None = None) ->
         The XML file; the numbers go to the file of the same name with the suffix ``.h5``.
     source : Path or RunFiles
         Folder of the run.
-    cells : {"prism"}, optional
-        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms`, also for memory.
+    cells, prism_layers
+        See `tiler.mesh_files.prisms.read_prisms`, also for memory; tetrahedra by default.
 
     Raises
     ------
@@ -65,11 +70,14 @@ def export_xdmf(output: Path, source: RunSource, *, cells: str | None = None) ->
     data = output.with_suffix(DATA)
     with replacing(output) as text_part, replacing(data) as data_part:
         with disk_errors(data):
-            if cells == "prism":
-                rows = _write_prisms(data_part, read_prisms(pieces))
+            if cells is not None:
+                mesh = read_prisms(pieces, cells, prism_layers)
+                n_cells = len(mesh.cells)
+                rows = _write_prisms(data_part, mesh)
             else:
-                rows = _write_data(data_part, pieces, *count_rows(pieces))
-        text_part.write_text(_render(data.name, rows, pieces.files.origin_words))
+                n_cells, n_facets = count_rows(pieces)
+                rows = _write_data(data_part, pieces, n_cells, n_facets)
+        text_part.write_text(_render(data.name, rows, n_cells, pieces.files.origin_words))
         # Numbers that do not belong to an old text must not be read with it.
         output.unlink(missing_ok=True)
 
@@ -127,8 +135,12 @@ def _put(data: h5py.Dataset, start: int, rows: NDArray[np.generic]) -> None:
 
 
 def _write_prisms(path: Path, mesh: PrismMesh) -> Rows:
-    """Write the numbers of prisms; returns how many rows and columns each data set has."""
-    sets: dict[str, NDArray[np.generic]] = {"points": mesh.points, "cells": mesh.cells}
+    """Write the numbers of prisms and others; returns how many rows and columns each data set has."""
+    cells = mesh.cells
+    if len(mesh.by_width()) > 1:
+        cells = np.column_stack((MIXED[mesh.widths], cells))
+        cells = cells[cells != NO_CORNER]
+    sets: dict[str, NDArray[np.generic]] = {"points": mesh.points, "cells": cells}
     if mesh.leaves is not None:
         sets[LEAVES] = mesh.leaves
     for name, width in (("", 3), ("side_", 4)):
@@ -139,7 +151,7 @@ def _write_prisms(path: Path, mesh: PrismMesh) -> Rows:
     return {name: (len(values), values[:1].size or 1) for name, values in sets.items()}
 
 
-def _render(data: str, rows: Rows, origin: str) -> str:
+def _render(data: str, rows: Rows, n_cells: int, origin: str) -> str:
     def item(name: str) -> str:
         n, width = rows[name]
         dtype = ARRAYS[name.removeprefix("side_")][0] if name != SIDES else np.int64
@@ -152,10 +164,13 @@ def _render(data: str, rows: Rows, origin: str) -> str:
 
     def grid(name: str, topology: str, cells: str, attributes: dict[str, str]) -> str:
         n, nodes = rows[cells]
+        size = (
+            f'NumberOfElements="{n}" NodesPerElement="{nodes}"' if nodes > 1 else f'NumberOfElements="{n_cells}"'
+        )
         lines = [
             f'    <Grid Name="{name}" GridType="Uniform">',
             '      <Time Value="0"/>',  # PyVista reads no file without
-            f'      <Topology TopologyType="{topology}" NumberOfElements="{n}" NodesPerElement="{nodes}">',
+            f'      <Topology TopologyType="{topology}" {size}>',
             f"        {item(cells)}",
             "      </Topology>",
             '      <Geometry GeometryType="XYZ">',
@@ -171,7 +186,7 @@ def _render(data: str, rows: Rows, origin: str) -> str:
         return "\n".join([*lines, "    </Grid>", ""])
 
     tags = {name: name for name in ("region", LEAVES) if name in rows}
-    grids = [grid("mesh", TOPOLOGIES[rows["cells"][1]], "cells", tags)]
+    grids = [grid("mesh", TOPOLOGIES.get(rows["cells"][1], "Mixed"), "cells", tags)]
     grids.append(grid("facets", "Triangle", "facets", {"marker": "marker", "building": "building"}))
     if SIDES in rows:
         names = {"marker": "side_marker", "building": "side_building"}
@@ -183,7 +198,7 @@ def _render(data: str, rows: Rows, origin: str) -> str:
 FORMAT = Format(
     "mesh and marked facets for FEniCS and ParaView, with a file .h5 beside it",
     export_xdmf,
-    options=(CELLS, LARGEST_PART, ORIGIN),
+    options=(*CELLS, LARGEST_PART, ORIGIN),
     suffix=".xdmf",
     companion=".h5",
 )

@@ -1,7 +1,8 @@
 """Columns of cells as prisms: three tetrahedra that fill a prism between two levels become one cell (step 3.6).
 
-Columns of the layered mesher have as many levels on all sides of a cell, and their tetrahedra stand by threes. In
-other columns levels merge, and cells of neighbours would not meet side by side: such a mesh is refused.
+Columns of the layered mesher have as many levels on all sides of a cell, and their tetrahedra stand by threes: all
+of such a mesh may be prisms. In other columns levels merge, and a hybrid mesh has prisms near ground and roofs and
+tetrahedra elsewhere (`tiler.mesh_files.transitions`).
 """
 
 from dataclasses import dataclass
@@ -12,25 +13,34 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.regions import Region
 from stitch.pieces.conformity import group_rows
+from stitch.pieces.face_mates import FACES
 from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces
+from tiler.mesh_files.transitions import NO_CORNER, SIDES, find_cut_sides, halve_sides, split_prisms
 
 Ints = NDArray[np.int64]
-# Faces of a prism by its corners, counter-clockwise seen from outside: three or four of them.
-ENDS = np.array([[0, 2, 1], [3, 4, 5]])
-SIDES = np.array([[0, 1, 4, 3], [1, 2, 5, 4], [2, 0, 3, 5]])
-NO_CORNER = -1  # in the place of a triangle's fourth corner
+LAYERS = 10  # of prisms in a hybrid mesh, where nothing else is asked for
+# Faces of cells by their corners, counter-clockwise seen from outside; -1 stands for no fourth corner.
+ENDS = np.array([[0, 2, 1, NO_CORNER], [3, 4, 5, NO_CORNER]])
+PYRAMID = np.array([[0, 3, 2, 1], *([k, (k + 1) % 4, 4, NO_CORNER] for k in range(4))])
+FACES_OF = {
+    4: np.column_stack((FACES.astype(np.int64), np.full(4, NO_CORNER))),
+    5: PYRAMID,
+    6: np.concatenate((ENDS, SIDES)),
+}
 
 
 @dataclass(frozen=True, eq=False)
 class PrismMesh:
-    """The mesh of a run as ``m`` prisms on ``n`` points, and its faces; all of it is in memory.
+    """The mesh of a run as ``m`` prisms and other cells on ``n`` points, and its faces; all of it is in memory.
 
     Attributes
     ----------
     points : float64, (n, 3)
-        Points (m), by their numbers over the region.
+        Points (m), by their numbers over the region; then the middles of prisms that are cut.
     cells : int64, (m, 6)
-        A triangle, counter-clockwise seen from above, and the corners over it.
+        Prism: a triangle, counter-clockwise seen from above, and the corners over it. Pyramid: a quadrilateral,
+        counter-clockwise seen from the fifth corner, and that. Tetrahedron: four corners, of positive volume. The
+        places left are `NO_CORNER`.
     tile : int32, (m,)
         Which tile each is of, counted from 0 by name.
     inner : int64, (i, 4)
@@ -48,7 +58,8 @@ class PrismMesh:
     ground : tuple of str
         Names of the patches of the ground, by number; none without land cover.
     leaves : float32, (m,), or None
-        Leaf area density of each cell (m2/m3), that of the middle one of its three tetrahedra; None without trees.
+        Leaf area density of each cell (m2/m3), of a prism that of the middle one of its three tetrahedra; None
+        without trees.
     """
 
     points: NDArray[np.float64]
@@ -64,24 +75,55 @@ class PrismMesh:
     ground: tuple[str, ...] = ()
     leaves: NDArray[np.float32] | None = None
 
+    @property
+    def widths(self) -> Ints:
+        """Number of corners of each cell, (m,): 4, 5 or 6."""
+        found: Ints = (self.cells != NO_CORNER).sum(axis=1)
+        return found
+
+    def by_width(self) -> list[tuple[int, Ints]]:
+        """Give the kinds of cells that there are, most corners first: their number, and the rows of the cells."""
+        kinds = ((n, np.flatnonzero(self.widths == n)) for n in sorted(FACES_OF, reverse=True))
+        return [(n, rows) for n, rows in kinds if len(rows)]
+
+    def centres(self, cells: Ints | None = None) -> NDArray[np.float64]:
+        """Give the mean of the corners of some cells, or of all, float64 (k, 3) (m)."""
+        corners = self.cells if cells is None else self.cells[cells]
+        width = (corners != NO_CORNER).sum(axis=1)
+        centres = np.empty((len(corners), 3))
+        for n in FACES_OF:
+            rows = np.flatnonzero(width == n)
+            centres[rows] = self.points[corners[rows, :n]].mean(axis=1)
+        return centres
+
     def facets(self, width: int) -> tuple[Ints, NDArray[np.int32], Ints]:
         """Give the triangles (3) or quadrilaterals (4) of the boundary: corners, marker and building of each."""
         chosen = (self.outer[:, 3] != NO_CORNER) == (width == 4)
         return self.outer[chosen, :width], self.marker[chosen], self.building[chosen]
 
 
-def read_prisms(pieces: MeshPieces) -> PrismMesh:
+def read_prisms(
+    pieces: MeshPieces, kind: str = "prism", layers: int | None = None, *, polyhedra: bool = False
+) -> PrismMesh:
     """Read the mesh of a run as prisms.
 
     Parameters
     ----------
     pieces : MeshPieces
         The mesh.
+    kind : {"prism", "hybrid"}
+        Prisms alone; or prisms, and tetrahedra where columns have none, with a ring of cut prisms between them.
+    layers : int, optional
+        Of a hybrid mesh, how many prisms at most stand over each triangle of the ground and roofs; `LAYERS` by
+        default.
+    polyhedra : bool
+        Whether prisms beside tetrahedra have two triangles for a side, instead of being cut into pyramids and
+        tetrahedra: for programs that take cells of any faces.
 
     Raises
     ------
     ConfigError
-        If buildings have cells.
+        If buildings have cells, or there are less than one layer, or layers without a hybrid mesh.
     InputError
         If some of its cells are no thirds of prisms, or a piece is damaged.
 
@@ -89,29 +131,44 @@ def read_prisms(pieces: MeshPieces) -> PrismMesh:
     -----
     Memory is some 700 bytes for each prism.
     """
-    if Region.BUILDING in pieces.files.regions:
-        raise ConfigError("--cells prism: not with cells in buildings; leave it out, or mesh without --solids")
+    if layers is not None and (kind != "hybrid" or layers < 1):
+        raise ConfigError(f"--prism-layers {layers}: is for --cells hybrid, and 1 or more")
+    if len(pieces.files.regions) > 1:
+        what = "in buildings" if Region.BUILDING in pieces.files.regions else "in soil"
+        option = "--solids" if Region.BUILDING in pieces.files.regions else "--underground"
+        raise ConfigError(f"--cells {kind}: not with cells {what}; leave it out, or mesh without {option}")
     points = np.empty((pieces.n_points, 3))
-    cells, facets, marker, building = [], [], [], []
+    cells, turned, facets, marker, building = [], [], [], [], []
     leaves: list[NDArray[np.float32]] = []
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
         points[piece.ids] = piece.points
-        cells.append(piece.ids[_prisms_of(piece)])
+        rows, first, second_turned = _prisms_of(piece) if kind == "prism" else _hybrid_of(piece, layers or LAYERS)
+        cells.append(np.where(rows == NO_CORNER, NO_CORNER, piece.ids[rows]))
+        turned.append(second_turned)
         facets.append(piece.ids[piece.facets])
         marker.append(piece.marker)
         building.append(piece.building)
-        leaves += [] if piece.leaves is None else [piece.leaves[1::3]]
+        leaves += [] if piece.leaves is None else [piece.leaves[first + (rows[:, 4] != NO_CORNER)]]
     tile = np.repeat(np.arange(len(cells), dtype=np.int32), [len(part) for part in cells])
-    prisms = np.concatenate(cells)
-    inner, owner, neighbour, outer, outer_cell = _pair_faces(prisms)
-    row = _find_facets(outer, np.concatenate(facets))
-    marks, houses = np.concatenate(marker), np.concatenate(building)
+    prisms, triangles = np.concatenate(cells), np.concatenate(facets)
+    marks, houses, density = np.concatenate(marker), np.concatenate(building), _join(leaves)
+    if kind == "hybrid":
+        second = np.concatenate(turned)
+        cut = find_cut_sides(prisms, second, triangles, np.column_stack((marks, houses)))
+    if kind == "hybrid" and not polyhedra:
+        prisms, parent, middle = split_prisms(prisms, second, cut, len(points))
+        points = np.concatenate((points, points[middle].mean(axis=1)))
+        tile, density = tile[parent], None if density is None else density[parent]
+    listed = list_faces(prisms)
+    if kind == "hybrid" and polyhedra:
+        listed = halve_sides(*listed, prisms, second, cut)
+    faces = _pair_faces(*listed)
+    row = _find_facets(faces[3], triangles)
     if (np.append(marks, 0)[row] != marks[row[:, :1]]).any():
         raise InputError(f"{pieces.files.directory}: halves of a face have different markers; run again")
-    first = row[:, 0]
-    faces = inner, owner, neighbour, outer, outer_cell
-    return PrismMesh(points, prisms, tile, *faces, marks[first], houses[first], pieces.ground, _join(leaves))
+    first_half = row[:, 0]
+    return PrismMesh(points, prisms, tile, *faces, marks[first_half], houses[first_half], pieces.ground, density)
 
 
 def _join(leaves: list[NDArray[np.float32]]) -> NDArray[np.float32] | None:
@@ -157,24 +214,60 @@ def combine_cells(cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[
     return np.column_stack((low[:, 0], second, third, high[:, 0], over_second, over_third)), whole
 
 
-def _prisms_of(piece: MeshPiece) -> NDArray[np.int32]:
+Combined = tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.bool_]]
+
+
+def _prisms_of(piece: MeshPiece) -> Combined:
+    """Give the prisms of a piece, the first tetrahedron of each, and whether its third column rises second."""
     n = len(piece.cells) // 3
     prisms, whole = combine_cells(piece.cells[: 3 * n])
     if whole.all() and 3 * n == len(piece.cells):
-        return prisms
+        return prisms, np.arange(0, 3 * n, 3), _turns(piece.cells[::3], piece.cells[1::3])
     first = 3 * int(np.argmin(whole)) if not whole.all() else 3 * n
     x, y, z = piece.points[piece.cells[first]].mean(axis=0)
     raise InputError(
         f"tile {piece.name}: its cells are not all thirds of prisms, first at ({x:.1f}, {y:.1f}, {z:.1f}): levels "
-        "of its columns merge; mesh with --mesher layered and without --underground, or leave --cells prism out"
+        "of its columns merge; take --cells hybrid, or mesh with --mesher layered and without --underground"
     )
 
 
-def _pair_faces(cells: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+def _turns(first: NDArray[np.int32], second: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Tell whether the upright edge of the second of three tetrahedra is over the third corner of the first."""
+    turned: NDArray[np.bool_] = second[:, 0] == first[:, 2]
+    return turned
+
+
+def _hybrid_of(piece: MeshPiece, layers: int) -> Combined:
+    """Give the cells of a piece as `_prisms_of` does: the lowest prisms over each triangle, and tetrahedra."""
+    cells = piece.cells
+    n = len(cells)
+    prisms, whole = combine_cells(np.lib.stride_tricks.sliding_window_view(cells, 3, axis=0).swapaxes(1, 2))
+    # A cell stands on the one before it if that one's upper corners are its lower ones.
+    stands = (np.sort(cells[1:, :3], axis=1) == np.sort(cells[:-1, 1:], axis=1)).all(axis=1)
+    triangle = np.cumsum(np.concatenate(([0], ~stands)))
+    chosen, free, last, count = [], 0, -1, 0
+    for row, of in zip(np.flatnonzero(whole).tolist(), triangle[:-2][whole].tolist(), strict=True):
+        count = count if of == last else 0
+        last = of
+        if row >= free and count < layers:
+            chosen.append(row)
+            free, count = row + 3, count + 1
+    first = np.array(chosen, np.int64)
+    alone = np.ones(n, np.bool_)
+    for k in range(3):
+        alone[first + k] = False
+    tetrahedra = np.flatnonzero(alone)
+    rows = np.full((len(first) + len(tetrahedra), 6), NO_CORNER, np.int32)
+    rows[: len(first)], rows[len(first) :, :4] = prisms[first], cells[tetrahedra]
+    turned = np.zeros(len(rows), np.bool_)
+    turned[: len(first)] = _turns(cells[first], cells[first + 1])
+    begin = np.concatenate((first, tetrahedra))
+    order = np.argsort(begin)
+    return rows[order], begin[order], turned[order]
+
+
+def _pair_faces(faces: Ints, cell: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
     """Find the faces between two cells and those of one, as `PrismMesh` has them."""
-    ends = np.full((len(cells), 2, 4), NO_CORNER)
-    ends[:, :, :3] = cells[:, ENDS]
-    faces = np.concatenate((ends, cells[:, SIDES]), axis=1).reshape(-1, 4)
     group, n = group_rows(np.sort(faces, axis=1))
     order = np.argsort(group, kind="stable")
     last = np.cumsum(np.bincount(group, minlength=n)) - 1
@@ -183,10 +276,24 @@ def _pair_faces(cells: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
     if (last - first > 1).any():
         raise InputError("a face of three cells; run again")
     alone, pair = low == high, np.flatnonzero(low != high)
-    owner, neighbour = low[pair] // 5, high[pair] // 5
+    owner, neighbour = cell[low[pair]], cell[high[pair]]
     sequence = np.lexsort((neighbour, owner))
     outer = np.sort(low[alone])
-    return faces[low[pair]][sequence], owner[sequence], neighbour[sequence], faces[outer], outer // 5
+    return faces[low[pair]][sequence], owner[sequence], neighbour[sequence], faces[outer], cell[outer]
+
+
+def list_faces(cells: Ints) -> tuple[Ints, Ints]:
+    """List the faces of cells, (k, 4) as in `PrismMesh.outer`, and the cell of each, ascending."""
+    width = (cells != NO_CORNER).sum(axis=1)
+    padded = np.column_stack((cells, np.full(len(cells), NO_CORNER)))
+    faces, of = [], []
+    for corners, table in FACES_OF.items():
+        rows = np.flatnonzero(width == corners)
+        faces.append(padded[rows][:, table].reshape(-1, 4))
+        of.append(np.repeat(rows, len(table)))
+    cell = np.concatenate(of)
+    order = np.argsort(cell, kind="stable")
+    return np.concatenate(faces)[order], cell[order]
 
 
 def _find_facets(outer: Ints, facets: Ints) -> Ints:

@@ -21,7 +21,8 @@ from tests.helpers.vtk_readers import read_vtk
 from tests.tiler.export.conftest import Exported
 from tiler.export.export import export_run
 from tiler.mesh_files.mesh_pieces import open_pieces
-from tiler.mesh_files.prisms import NO_CORNER, PrismMesh, combine_cells, read_prisms
+from tiler.mesh_files.prisms import PrismMesh, combine_cells, read_prisms
+from tiler.mesh_files.transitions import NO_CORNER
 
 PRISMS = ("--cells", "prism")
 UPRIGHT = {Marker.WALL, Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH}
@@ -159,9 +160,57 @@ def test_openfoam_has_faces_of_three_and_of_four_corners(
 def test_columns_whose_levels_merge_are_refused(small_run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tile .*: its cells are not all thirds of prisms.*--mesher layered"):
         export_run(small_run, tmp_path / "a.vtu", name="vtu", options={"cells": "prism"})
-    with pytest.raises(ConfigError, match=r"--parts: not with --cells prism.*decomposePar"):
-        export_run(small_run, tmp_path / "case", name="openfoam", options={"cells": "prism", "parts": 2})
+    with pytest.raises(ConfigError, match=r"--buildings zones: not with --cells prism"):
+        export_run(small_run, tmp_path / "case", name="openfoam", options={"cells": "prism", "buildings": "zones"})
+    with pytest.raises(ConfigError, match=r"--prism-layers 3: is for --cells hybrid"):
+        export_run(small_run, tmp_path / "a.vtu", name="vtu", options={"cells": "prism", "prism_layers": 3})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_hybrid_cells_fill_the_air_of_any_columns_and_meet_face_to_face(
+    small_run: Path, prisms: PrismMesh, layered_run: Path, exported: Exported
+) -> None:
+    # Reading them proves that all faces but those of the boundary are those of two cells, quadrilaterals too.
+    mesh = read_prisms(open_pieces(small_run), "hybrid", 4)
+    count = {width: len(rows) for width, rows in mesh.by_width()}
+    assert set(count) == {4, 5, 6}
+    words = ("--cells", "hybrid", "--prism-layers", "4")
+    grid = pyvista.read(exported(small_run, "vtu", *words))
+    assert {kind: int((grid.celltypes == kind).sum()) for kind in (10, 14, 13)} == {
+        10: count[4],
+        14: count[5],
+        13: count[6],
+    }
+    volume = grid.compute_cell_sizes(length=False, area=False)["Volume"]
+    assert volume.min() > 0
+    pieces = open_pieces(small_run)
+    parts = [pieces.read(k) for k in range(len(pieces.names))]
+    total = sum(compute_cell_volumes(piece.points, piece.cells)[0].sum() for piece in parts)
+    assert volume.sum() == pytest.approx(total, rel=1e-9)
+    msh = meshio.read(exported(small_run, "msh", *words))
+    assert [len(msh.cells_dict[kind]) for kind in ("tetra", "pyramid", "wedge")] == [count[n] for n in (4, 5, 6)]
+    with h5py.File(exported(small_run, "cgns", *words)) as file:
+        kinds = [file[f"city/air/{name}/ data"][0] for name in ("cells", "pyramids", "tetrahedra")]
+    assert kinds == [14, 12, 10]
+    with h5py.File(exported(small_run, "xdmf", *words).with_suffix(".h5")) as file:
+        assert len(file["cells"]) == sum((width + 1) * n for width, n in count.items())
+    # In layers no prism is lost where there are enough of them.
+    assert (read_prisms(open_pieces(layered_run), "hybrid", 1000).cells == prisms.cells).all()
+
+
+def test_parts_of_a_hybrid_mesh_share_the_faces_between_them(small_run: Path, exported: Exported) -> None:
+    options = ("--cells", "hybrid")
+    (whole,) = json.loads((exported(small_run, "openfoam", *options) / "export.json").read_text())["meshes"]
+    case = exported(small_run, "openfoam", *options, "--parts", "3")
+    record = json.loads((case / "export.json").read_text())
+    parts = record["meshes"]
+    assert sum(part["cells"] for part in parts) == whole["cells"]
+    between = sum(n for _, _, n in record["interfaces"])
+    assert between > 0
+    assert sum(part["faces"] for part in parts) == whole["faces"] + between
+    assert sum(part["inner_faces"] for part in parts) == whole["inner_faces"] - between
+    for name, n in whole["patches"].items():
+        assert sum(part["patches"][name] for part in parts) == n
 
 
 @pytest.mark.long

@@ -137,7 +137,8 @@ def test_what_the_mesh_does_not_allow_is_said(
 def test_distances_of_first_cells_by_hand() -> None:
     # A cell of 4 m over the ground, and one of 0.4 m at a slope of 45 degrees: centres 1 m and 0.1/sqrt(2) m off.
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 4], [1, 0, 1], [0, 0, 0.4]])
-    counts = count_distances(points, np.array([[0, 1, 2, 3], [0, 4, 2, 5]]), np.array([[0, 2, 1], [0, 2, 4]]))
+    centres = points[[[0, 1, 2, 3], [0, 4, 2, 5]]].mean(axis=1)
+    counts = count_distances(centres, points, np.array([[0, 2, 1], [0, 2, 4]]))
     found = np.flatnonzero(counts)
     assert counts.sum() == 2
     assert [DISTANCES[k - 1] <= d <= DISTANCES[k] for k, d in zip(found, (0.0707, 1.0), strict=True)] == [True] * 2
