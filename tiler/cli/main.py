@@ -145,11 +145,13 @@ def _run_config(
     dashboard: str | None = None,
     report: bool = False,
 ) -> int:
-    from tiler.executors.dask_settings import GARBAGE, start_fork_server
+    from tiler.executors.dask_settings import GARBAGE, keep_memory, start_fork_server
     from tiler.store.out_folder import has_record
 
     if config.workers and not config.on_cluster and not has_record(config.out):
         start_fork_server()  # at once, as there is something to do; else with the first task
+    elif not config.workers:
+        keep_memory()
     gc.set_threshold(GARBAGE)
     from tiler.monitoring.event_log import EventLog
     from tiler.monitoring.events import open_log

@@ -7,6 +7,7 @@ priority first; idle workers steal within 0.1 s. Dask does not send the tasks of
 `tiler.executors.dask_executor` tells by their trace files which of them had begun.
 """
 
+import ctypes
 import os
 import sys
 from collections.abc import Mapping
@@ -24,6 +25,11 @@ ENVIRONMENT: Mapping[str, int] = {
     "MALLOC_ARENA_MAX": 1,
     "MALLOC_TRIM_THRESHOLD_": 2**28,
     "MALLOC_MMAP_THRESHOLD_": 2**25,
+}
+MALLOPT: Mapping[str, int] = {  # numbers of the same in glibc's malloc.h
+    "MALLOC_TRIM_THRESHOLD_": -1,
+    "MALLOC_MMAP_THRESHOLD_": -3,
+    "MALLOC_ARENA_MAX": -8,
 }
 SCHEDULER: Mapping[str, Any] = {
     "distributed.scheduler.allowed-failures": 0,
@@ -72,6 +78,14 @@ def as_variables(settings: Mapping[str, Any]) -> dict[str, Any]:
     {'DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL': '200ms'}
     """
     return {"DASK_" + name.upper().replace(".", "__").replace("-", "_"): value for name, value in settings.items()}
+
+
+def keep_memory() -> None:
+    """Apply the settings of malloc of `ENVIRONMENT` to this process, which runs tasks itself; with glibc alone."""
+    choose = getattr(ctypes.CDLL(None), "mallopt", None)
+    if choose is not None:
+        for name, number in MALLOPT.items():
+            choose(number, ENVIRONMENT[name])
 
 
 def start_fork_server() -> None:

@@ -72,7 +72,18 @@ def run_in_fresh_process(code: str) -> str:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_the_command_looks_for_garbage_seldom() -> None:
-    nowhere = "main(['run', 'no/such.laz', '--workers', '0'])"
-    told = f"import gc; from tiler.cli.main import main; {nowhere}; print(gc.get_threshold()[0])"
-    assert run_in_fresh_process(told) == str(GARBAGE)
+def test_a_serial_run_looks_for_garbage_seldom_and_keeps_freed_memory() -> None:
+    code = """
+import gc, resource
+from tiler.cli.main import main
+main(["run", "no/such.laz", "--workers", "0"])
+faults = []
+for _ in range(3):
+    large = [bytearray(24 * 2**20) for _ in range(4)]
+    del large
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+print(gc.get_threshold()[0], faults[2] - faults[1])
+"""
+    threshold, faults = map(int, run_in_fresh_process(code).split())
+    assert threshold == GARBAGE
+    assert faults < 1000, "of 24,576 pages"
