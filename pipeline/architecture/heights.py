@@ -3,10 +3,12 @@
 import math
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from pipeline.architecture.levels import at_eaves
 from pipeline.architecture.parameters import BuildingPart, House
-from pipeline.architecture.roof_sides import list_sides, wall_frame
+from pipeline.architecture.roof_sides import along_wall, list_sides
 
 Array = NDArray[np.float64]
 
@@ -30,15 +32,10 @@ def house_heights(house: House, xy: Array) -> Array:
     east, north = xy[:, 0] - house.x, xy[:, 1] - house.y
     x, y = east * math.cos(angle) + north * math.sin(angle), north * math.cos(angle) - east * math.sin(angle)
     sides = list_sides(house)
-    far = house.roof.overhang
-    ends = far * sides[0].slope / sides[1].slope if house.roof.shape == "pyramidal" else far
-    over = (x >= -ends) & (x <= house.length + ends) & (y >= -far) & (y <= house.width + far)
-    roof = np.full(len(xy), np.inf)
-    for side in sides:
-        roof = np.minimum(roof, house.height + side.slope * _along_wall(house, side.wall, x, y)[1])
-    height = np.where(over, roof, -np.inf)
+    height = _plan_heights(at_eaves(house), x, y) if house.plan else _roof_heights(house, x, y)
+    over = np.isfinite(height)
     for dormer in house.dormers:
-        u, v = _along_wall(house, dormer.side, x, y)
+        u, v = along_wall(house, dormer.side, x, y)
         slope = next(side.slope for side in sides if side.wall == dormer.side)
         half = dormer.width / 2
         tilt = dormer.rise / half
@@ -47,7 +44,7 @@ def house_heights(house: House, xy: Array) -> Array:
         inside = (np.abs(u - dormer.along - half) <= half) & (v >= dormer.up) & over
         height = np.where(inside, np.maximum(height, top), height)
     for chimney in house.chimneys:
-        u, v = _along_wall(house, chimney.side, x, y)
+        u, v = along_wall(house, chimney.side, x, y)
         inside = (np.abs(u - chimney.along - chimney.width / 2) <= chimney.width / 2) & (
             np.abs(v - chimney.up - chimney.width / 2) <= chimney.width / 2
         )
@@ -58,13 +55,28 @@ def house_heights(house: House, xy: Array) -> Array:
     return np.where(np.isfinite(height), house.z + height, np.nan)
 
 
-def _along_wall(house: House, wall: int, x: Array, y: Array) -> tuple[Array, Array]:
-    """Places in the frame of a wall: along it, and inwards."""
-    (x0, y0), (u, v) = wall_frame(house, wall)
-    return (x - x0) * u + (y - y0) * v, (y - y0) * u - (x - x0) * v
+def _roof_heights(house: House, x: Array, y: Array) -> Array:
+    """Height of a roof with its overhangs above the ground; -inf beside it."""
+    sides, far = list_sides(house), house.roof.overhang
+    ends = far * sides[0].slope / sides[1].slope if house.roof.shape == "pyramidal" else far
+    over = (x >= -ends) & (x <= house.length + ends) & (y >= -far) & (y <= house.width + far)
+    roof = np.full(len(x), np.inf)
+    for side in sides:
+        roof = np.minimum(roof, house.height + side.slope * along_wall(house, side.wall, x, y)[1])
+    return np.where(over, roof, -np.inf)
+
+
+def _plan_heights(house: House, x: Array, y: Array) -> Array:
+    """Height of a roof without overhangs over a plan, as `_roof_heights`: of each side over its own polygon."""
+    height = np.full(len(x), -np.inf)
+    for side in list_sides(house):
+        u, v = along_wall(house, side.wall, x, y)
+        over = shapely.intersects_xy(side.polygon, u, v)
+        height = np.where(over, np.maximum(height, house.height + side.slope * v), height)
+    return height
 
 
 def _is_in_part(house: House, part: BuildingPart, x: Array, y: Array) -> NDArray[np.bool_]:
-    u, v = _along_wall(house, part.wall, x, y)
+    u, v = along_wall(house, part.wall, x, y)
     inside: NDArray[np.bool_] = (u >= part.along) & (u <= part.along + part.width) & (v >= -part.depth) & (v <= 0)
     return inside

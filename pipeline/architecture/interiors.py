@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 
 from pipeline.architecture.levels import Volume, move_walls
-from pipeline.architecture.parameters import WALLS, House
-from pipeline.architecture.roof_sides import list_sides, place
+from pipeline.architecture.parameters import House
+from pipeline.architecture.roof_sides import has_room, list_sides, wall_rings
 from pipeline.architecture.shell import Detail, make_shell
-from pipeline.architecture.surfaces import GROUND, Surface, prism, to_town
+from pipeline.architecture.surfaces import GROUND, level_face, prism, to_town
 
 INTERIORS = ("0", "1", "2.2", "2.3")
 JOIST, ROOF = 0.2, 0.2  # m, thickness of ceilings, and of roofs measured upwards
@@ -43,14 +43,14 @@ def make_interior(house: House, level: str) -> list[Room]:
     if level == "1":
         shell = make_shell(replace(inner, height=inner.height - ROOF), Detail())
         return [Room(-1, Volume(-1, True, to_town(inner, shell)))]
-    ring = [place(inner, wall, 0.0, 0.0, 0.0)[:2] for wall in range(WALLS)]
+    ring, *holes = wall_rings(inner)
     rooms = []
     for storey in range(house.storeys):
         low = storey * house.storey_height
         if level == "0":
-            surfaces = [Surface(GROUND, [(x, y, low) for x, y in reversed(ring)], [])]
+            surfaces = [level_face(GROUND, [ring, *holes], low)]
         else:
-            surfaces = prism(ring, low, low + house.storey_height - JOIST)
+            surfaces = prism(ring, low, low + house.storey_height - JOIST, holes)
         rooms.append(Room(storey, Volume(-1, level != "0", to_town(inner, surfaces))))
     if level == "2.3" and (attic := _attic(house)) is not None:
         rooms.append(Room(house.storeys, Volume(-1, True, to_town(attic, make_shell(attic, Detail())))))
@@ -62,7 +62,10 @@ def _attic(house: House) -> House | None:
     slope = list_sides(house)[0].slope
     if house.roof.rise < LEAST_ATTIC + ROOF:
         return None
-    inner = move_walls(house, -max(house.wall_thickness, (ROOF + LEAST_KNEE) / slope))
+    far = -max(house.wall_thickness, (ROOF + LEAST_KNEE) / slope)
+    if house.plan and not has_room(house, far):
+        return None
+    inner = move_walls(house, far)
     knee = inner.height - house.height - ROOF
     if knee + inner.roof.rise < LEAST_ATTIC or min(inner.length, inner.width) < LEAST_ATTIC:
         return None

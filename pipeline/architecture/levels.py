@@ -6,12 +6,22 @@ from typing import Literal, TypeVar
 
 import shapely
 
-from pipeline.architecture.parameters import WALLS, BuildingPart, Chimney, Dormer, House, RoofWindow
-from pipeline.architecture.roof_sides import Flat, list_sides, place
+from pipeline.architecture.parameters import BuildingPart, Chimney, Dormer, Flat, House, Rings, RoofWindow
+from pipeline.architecture.roof_sides import (
+    along_wall,
+    has_room,
+    list_sides,
+    offset_plan,
+    place,
+    wall_length,
+    wall_rings,
+)
 from pipeline.architecture.shell import Detail, make_shell
-from pipeline.architecture.surfaces import GROUND, ROOF, Surface, prism, to_town
+from pipeline.architecture.surfaces import GROUND, ROOF, Surface, level_face, prism, to_town
+from pipeline.data.errors import InputError
 
 LEVELS = tuple(f"{whole}.{part}" for whole in range(4) for part in range(4))
+LEAST_MARGIN = 0.02  # m, from the ends of a wall, of what lies in it after it was moved
 FOOTPRINTS = ("walls", "eaves")
 TOPS = {"eaves": 0.0, "third": 1 / 3, "half": 0.5, "two-thirds": 2 / 3, "ridge": 1.0}  # share of the roof's rise
 
@@ -128,6 +138,8 @@ def move_walls(house: House, far: float) -> House:
     roof = house.roof
     if far == 0:
         return house
+    if house.plan:
+        return _move_plan(house, far)
     sides = list_sides(house)
     fall = far * sides[0].slope
     ends = fall / sides[1].slope if roof.shape == "pyramidal" else far
@@ -157,6 +169,46 @@ def move_walls(house: House, far: float) -> House:
     return replace(moved, x=corner[0], y=corner[1])
 
 
+def _move_plan(house: House, far: float) -> House:
+    """Move the walls of a plan; its frame stays where it is, and what lies in a wall that is too short is gone."""
+    if not has_room(house, far):
+        raise InputError(f"house {house.id}: its walls cannot stand {far:g} m further out; change its plan")
+    sides = list_sides(house)
+    height = house.height - far * sides[0].slope
+    bare = replace(house, plan=offset_plan(house, far), roof=replace(house.roof, rise=1.0))
+    rise = sides[0].slope / list_sides(bare)[0].slope if house.roof.shape != "flat" else 0.0
+
+    def shift(wall: int) -> tuple[float, float]:
+        along, away = along_wall(bare, wall, *place(house, wall, 0.0, 0.0, 0.0)[:2])
+        return float(along), float(away)
+
+    def keep(things: Sequence[OnRoof]) -> tuple[OnRoof, ...]:
+        moves = [shift(one.side) for one in things]
+        return tuple(
+            replace(one, along=one.along + along, up=one.up + away)
+            for one, (along, away) in zip(things, moves, strict=True)
+        )
+
+    return replace(
+        bare,
+        length=house.length + 2 * far,
+        width=house.width + 2 * far,
+        height=height,
+        roof=replace(house.roof, rise=rise, overhang=max(house.roof.overhang - far, 0.0)),
+        parts=tuple(replace(part, along=part.along + shift(part.wall)[0]) for part in house.parts),
+        dormers=keep(house.dormers),
+        chimneys=keep(house.chimneys),
+        roof_windows=keep(house.roof_windows),
+        openings=tuple(
+            replace(one, along=along)
+            for one in house.openings
+            if one.sill + one.height < height
+            and (along := one.along + shift(one.wall)[0]) > LEAST_MARGIN
+            and along + one.width < wall_length(bare, one.wall) - LEAST_MARGIN
+        ),
+    )
+
+
 def _move_in(things: Sequence[OnRoof], far: float, ends: float) -> tuple[OnRoof, ...]:
     """Keep what stands on a roof where it is; front and back walls move out by `far`, the others by `ends`."""
     shifts = ((ends, far), (far, ends))  # along a wall and away from it, by the wall's parity
@@ -173,48 +225,40 @@ def part_ring(house: House, part: BuildingPart) -> list[Flat]:
     return [place(house, part.wall, along, away, 0.0)[:2] for along, away in flats]
 
 
-def outline_ring(house: House) -> list[Flat]:
-    """Outline of the main body and its parts in the frame of the house, counter-clockwise from above."""
-    rings = [_body_ring(house), *(part_ring(house, part) for part in house.parts)]
-    union = shapely.union_all([shapely.Polygon(ring) for ring in rings], grid_size=1e-6)
-    ring = shapely.get_coordinates(shapely.orient_polygons(shapely.get_exterior_ring(union)))
-    if not shapely.is_ccw(shapely.linearrings(ring)):
-        ring = ring[::-1]
-    return [(float(x), float(y)) for x, y in ring[:-1]]
+def outline_rings(house: House) -> Rings:
+    """Outline of the main body and its parts in the frame of the house: its border, then courtyards."""
+    border, *holes = wall_rings(house)
+    rings = [shapely.Polygon(border, holes), *(shapely.Polygon(part_ring(house, part)) for part in house.parts)]
+    union = shapely.orient_polygons(shapely.union_all(rings, grid_size=1e-6))
+    return tuple(
+        tuple((float(x), float(y)) for x, y in ring.coords[:-1]) for ring in (union.exterior, *union.interiors)
+    )
 
 
-def _body_ring(house: House) -> list[Flat]:
-    return [place(house, wall, 0.0, 0.0, 0.0)[:2] for wall in range(WALLS)]
-
-
-def _bounding_ring(house: House) -> list[Flat]:
-    corners = [_body_ring(house), *(part_ring(house, part) for part in house.parts)]
+def _bounding_rings(house: House) -> Rings:
+    corners = [wall_rings(house)[0], *(part_ring(house, part) for part in house.parts)]
     xs, ys = zip(*(corner for ring in corners for corner in ring), strict=True)
     low_x, high_x, low_y, high_y = min(xs), max(xs), min(ys), max(ys)
-    return [(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)]
+    return (((low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)),)
 
 
-def level_ring(house: House, level: str) -> list[Flat]:
-    """Outline of a house at level 0 or 1, in its frame, counter-clockwise from above."""
-    return {"0": _bounding_ring, "1": _body_ring, "2": outline_ring, "3": outline_ring}[level[2]](house)
+def level_rings(house: House, level: str) -> Rings:
+    """Outline of a house at level 0 or 1, in its frame, as `outline_rings`."""
+    return {"0": _bounding_rings, "1": wall_rings, "2": outline_rings, "3": outline_rings}[level[2]](house)
 
 
 def make_blocks(house: House, level: str, top: float) -> list[Volume]:
     """Make a house at level 0 or 1, in its frame; blocks of its main body are `top` high (m)."""
-    ring = level_ring(house, level)
     if level[0] == "1":
-        if level == "1.3":
-            return [Volume(-1, True, prism(_body_ring(house), 0.0, top)), *make_parts(house)]
-        return [Volume(-1, True, prism(ring, 0.0, top))]
-    surfaces = [Surface(GROUND, [(x, y, 0.0) for x, y in reversed(ring)], [])]
+        ring, *holes = level_rings(house, "1.1" if level == "1.3" else level)
+        return [Volume(-1, True, prism(ring, 0.0, top, holes)), *(make_parts(house) if level == "1.3" else [])]
+    surfaces = [level_face(GROUND, level_rings(house, level), 0.0)]
     if level == "0.3":
         eaves = at_eaves(house)
-        shift = (eaves.length - house.length) / 2, (eaves.width - house.width) / 2
-        edge = [(x - shift[0], y - shift[1], eaves.height) for x, y in _body_ring(eaves)]
-        surfaces.append(Surface(ROOF, edge, []))
-        surfaces += [
-            Surface(ROOF, [(x, y, part.height) for x, y in part_ring(house, part)], []) for part in house.parts
-        ]
+        shift = (0.0, 0.0) if house.plan else ((eaves.length - house.length) / 2, (eaves.width - house.width) / 2)
+        edges = [[(x - shift[0], y - shift[1]) for x, y in ring] for ring in wall_rings(eaves)]
+        surfaces.append(level_face(ROOF, edges, eaves.height))
+        surfaces += [level_face(ROOF, [part_ring(house, part)], part.height) for part in house.parts]
     return [Volume(-1, False, surfaces)]
 
 

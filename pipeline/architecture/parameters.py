@@ -5,7 +5,9 @@ from typing import Literal
 
 RoofShape = Literal["flat", "shed", "gabled", "hipped", "pyramidal"]
 ROOF_SHAPES: tuple[RoofShape, ...] = ("flat", "shed", "gabled", "hipped", "pyramidal")
-WALLS = 4  # of a building, counter-clockwise: the front, the right side, the back and the left side
+PLANS = ("rectangle", "L", "T", "U", "courtyard")
+Flat = tuple[float, float]
+Rings = tuple[tuple[Flat, ...], ...]  # border counter-clockwise, then holes clockwise (m)
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,7 @@ class Opening:
     kind : str
         ``"window"`` or ``"door"``.
     wall : int
-        Its wall, 0 to 3.
+        Its wall, as of `House`.
     along, sill : float
         Its lower left corner, seen from outside: along the wall, and above the ground (m).
     width, height : float
@@ -130,7 +132,7 @@ class BuildingPart:
     kind : str
         ``"garage"`` or ``"alcove"``.
     wall : int
-        The wall, 0 to 3.
+        The wall, as of `House`.
     along : float
         Its left end along the wall, seen from outside (m).
     width, depth, height : float
@@ -175,6 +177,14 @@ class House:
         Of construction.
     use : str
         What it is used for.
+    plan : tuple
+        Outline of the main body with its courtyards in its frame, of any form; none for a rectangle.
+
+    Notes
+    -----
+    Walls are numbered along the outline: those of a rectangle are the front, the right side, the back and the
+    left side. Hipped and gabled roofs over a plan are those of its straight skeleton; flat ones, and sheds that
+    rise from wall 0, are one plane.
     """
 
     id: str
@@ -196,6 +206,7 @@ class House:
     openings: tuple[Opening, ...] = ()
     year: int = 2000
     use: str = "residential"
+    plan: Rings = ()
 
     @property
     def storey_height(self) -> float:

@@ -1,13 +1,17 @@
 """The 392 representations of a house of Random3Dcity: level, place of walls, height, semantics, solid or not."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+
+import numpy as np
+import shapely
 
 from pipeline.architecture.levels import (
     DETAILS,
     Volume,
     at_eaves,
-    level_ring,
+    level_rings,
     make_blocks,
     make_level,
     make_parts,
@@ -15,8 +19,9 @@ from pipeline.architecture.levels import (
     part_ring,
 )
 from pipeline.architecture.parameters import House
+from pipeline.architecture.roof_sides import list_sides
 from pipeline.architecture.shell import make_shell
-from pipeline.architecture.surfaces import GROUND, ROOF, Surface, to_town
+from pipeline.architecture.surfaces import GROUND, ROOF, level_face, to_town
 
 # Where walls stand, by the names of the paper's data: as a share of the overhang.
 WALLS_AT = {"F0": 0.0, "F1": 1.0, "Fd": 0.5}
@@ -123,12 +128,10 @@ def make_representation(house: House, asked: Representation) -> list[Volume]:
 
 def _outlines(house: House, level: str, top: float) -> Volume:
     """The outline on the ground, and that of the roof at some height."""
-    ring = level_ring(house, level)
-    surfaces = [Surface(GROUND, [(x, y, 0.0) for x, y in reversed(ring)], [])]
-    roofs = [(level_ring(house, "0.1") if level == "0.3" else ring, top)]
+    surfaces = [level_face(GROUND, level_rings(house, level), 0.0)]
+    surfaces.append(level_face(ROOF, level_rings(house, "0.1" if level == "0.3" else level), top))
     if level == "0.3":
-        roofs += [(part_ring(house, part), part.height) for part in house.parts]
-    surfaces += [Surface(ROOF, [(x, y, high) for x, y in edge], []) for edge, high in roofs]
+        surfaces += [level_face(ROOF, [part_ring(house, part)], part.height) for part in house.parts]
     return Volume(-1, False, surfaces)
 
 
@@ -149,7 +152,7 @@ def reference_height(house: House, name: str) -> float:
     if name not in HEIGHTS:
         raise ValueError(f"height {name!r}; one of {', '.join(HEIGHTS)}")
     parts = [(part.width * part.depth, part.height) for part in house.parts if name in ("HAvgAll", "HMedian")]
-    body = house.length * house.width
+    body = sum(_areas(house)) if house.plan else house.length * house.width
     whole = body + sum(area for area, _ in parts)
     if name.startswith("HAvg"):
         return (body * (low + rise * _mean_share(house)) + sum(area * high for area, high in parts)) / whole
@@ -161,8 +164,18 @@ def reference_height(house: House, name: str) -> float:
     return most
 
 
+def _areas(house: House, within: Sequence[shapely.Polygon] = ()) -> list[float]:
+    """Area in plan of each side of a roof (m2), or of its share within a polygon in the frame of its wall."""
+    found = [side.polygon for side in list_sides(house)]
+    return [one.intersection(other).area for one, other in zip(found, within or found, strict=True)]
+
+
 def _mean_share(house: House) -> float:
     """Mean height of a roof above the eaves, over its rise."""
+    if house.plan:
+        steep = replace(house, roof=replace(house.roof, rise=1.0))
+        up = [side.slope * side.polygon.centroid.y for side in list_sides(steep)]
+        return float(np.average(up, weights=_areas(house)))
     if house.roof.shape == "hipped":
         return 1 / 2 - house.width / (6 * house.length)
     return {"flat": 0.0, "shed": 1 / 2, "gabled": 1 / 2, "pyramidal": 1 / 3}[house.roof.shape]
@@ -175,6 +188,10 @@ def _share_above(house: House, height: float) -> float:
     up = (height - house.height) / house.roof.rise if house.roof.rise else 1.0
     if up >= 1:
         return 0.0
+    if house.plan:
+        far = 2 * (house.length + house.width)
+        above = [shapely.box(-far, (height - house.height) / side.slope, far, far) for side in list_sides(house)]
+        return sum(_areas(house, above)) / sum(_areas(house))
     if house.roof.shape in ("shed", "gabled"):
         return 1 - up
     ends = house.width / house.length if house.roof.shape == "hipped" else 1.0

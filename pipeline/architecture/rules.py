@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.architecture.parameters import ROOF_SHAPES
+from pipeline.architecture.parameters import PLANS, ROOF_SHAPES
 
 Value = float | str
 _TRIES = 100  # draws of a normal distribution until one lies within its limits
@@ -59,6 +59,7 @@ class Distribution:
 SIZES: dict[str, tuple[float, float]] = {
     "length": (3.0, 300.0),
     "width": (3.0, 300.0),
+    "wing": (3.0, 50.0),
     "storeys": (1.0, 200.0),
     "storey_height": (2.0, 10.0),
     "roof_pitch": (3.0, 70.0),
@@ -80,11 +81,13 @@ SIZES: dict[str, tuple[float, float]] = {
     "door_height": (1.5, 5.0),
     "year": (1.0, 2100.0),
 }
-WORDS: dict[str, tuple[str, ...] | None] = {"roof_shape": ROOF_SHAPES, "use": None}
+WORDS: dict[str, tuple[str, ...] | None] = {"footprint": PLANS, "roof_shape": ROOF_SHAPES, "use": None}
 
 _DETACHED: dict[str, Any] = {
+    "footprint": "rectangle",
     "length": {"uniform": [9.0, 14.0]},
     "width": {"uniform": [7.0, 9.5]},
+    "wing": {"uniform": [5.0, 7.0]},
     "storeys": {"choice": [1, 2, 3], "weights": [0.35, 0.5, 0.15]},
     "storey_height": {"normal": [2.8, 0.15], "within": [2.5, 3.3]},
     "roof_shape": {"choice": list(ROOF_SHAPES), "weights": [0.1, 0.1, 0.45, 0.2, 0.15]},
@@ -129,6 +132,15 @@ PRESETS: dict[str, dict[str, Any]] = {
         "garage": 0.0,
         "dormers": {"choice": [0, 4, 6, 8]},
     },
+    "wings": _DETACHED
+    | {
+        "footprint": {"choice": ["L", "T", "U", "courtyard"]},
+        "length": {"uniform": [22.0, 27.0]},
+        "width": {"uniform": [18.0, 21.0]},
+        "storeys": {"choice": [1, 2, 3]},
+        "roof_shape": {"choice": ["hipped", "gabled", "shed", "flat"], "weights": [0.4, 0.4, 0.1, 0.1]},
+        "dormers": {"choice": [0, 2, 3, 4]},
+    },
     "towers": _DETACHED
     | {
         "length": {"uniform": [20.0, 30.0]},
@@ -154,8 +166,8 @@ def make_rules(given: Mapping[str, Any], *, preset: str = "detached") -> dict[st
     given : mapping
         By the name of each rule: a number or a word; ``{"uniform": [least, greatest]}``; ``{"normal": [mean,
         deviation], "within": [least, greatest]}``; or ``{"choice": [...], "weights": [...]}``. Lengths are in
-        metres, ``roof_pitch`` in degrees; ``garage``, ``alcove``, ``chimney`` and ``dormer_gabled`` are
-        probabilities.
+        metres, ``wing`` is the depth of the wings of a footprint that is no rectangle, ``roof_pitch`` is in
+        degrees; ``garage``, ``alcove``, ``chimney`` and ``dormer_gabled`` are probabilities.
     preset : str
         The preset of `PRESETS` whose rules hold where none is given.
 

@@ -2,17 +2,28 @@
 
 from dataclasses import dataclass
 
-from pipeline.architecture.parameters import Chimney, Dormer, House, Opening, RoofWindow
+from pipeline.architecture.parameters import Chimney, Dormer, Flat, House, Opening, RoofWindow
 from pipeline.architecture.roof_sides import (
-    Flat,
     Point,
     RoofSide,
+    count_walls,
     list_sides,
     overhang_strips,
     place,
     wall_ring,
+    wall_rings,
 )
-from pipeline.architecture.surfaces import CLOSURE, DOOR, GROUND, ROOF, WALL, WINDOW, Surface, fill_hole
+from pipeline.architecture.surfaces import (
+    CLOSURE,
+    DOOR,
+    GROUND,
+    ROOF,
+    WALL,
+    WINDOW,
+    Surface,
+    fill_hole,
+    level_face,
+)
 
 
 @dataclass(frozen=True)
@@ -45,17 +56,15 @@ def make_shell(house: House, detail: Detail) -> list[Surface]:
     (paper, 3.2.2), so that it is closed with the chimney or without.
     """
     surfaces: list[Surface] = []
-    base: list[Point] = []
-    for wall in range(4):
+    for wall in range(count_walls(house)):
         ring = wall_ring(house, wall)
-        base.append(place(house, wall, 0.0, 0.0, 0.0))
         front = Surface(WALL, [place(house, wall, along, 0.0, z) for along, z in ring], [])
         surfaces.append(front)
         if detail.openings:
             for opening in house.openings:
                 if opening.wall == wall:
                     surfaces += _set_opening(house, front, opening, house.embrasure if detail.embrasures else 0.0)
-    surfaces.append(Surface(GROUND, base[::-1], []))
+    surfaces.append(level_face(GROUND, wall_rings(house), 0.0))
     for side in list_sides(house):
         surfaces += _cover_side(house, side, detail)
     if detail.overhangs:
@@ -69,7 +78,12 @@ def _on_roof(house: House, wall: int, slope: float, flat: Flat) -> Point:
 
 
 def _cover_side(house: House, side: RoofSide, detail: Detail) -> list[Surface]:
-    roof = Surface(ROOF, [_on_roof(house, side.wall, side.slope, flat) for flat in side.ring], [])
+    border, *holes = (
+        [_on_roof(house, side.wall, side.slope, flat) for flat in ring] for ring in (side.ring, *side.holes)
+    )
+    if side.rises:
+        border = [(x, y, house.height + rise) for (x, y, _), rise in zip(border, side.rises, strict=True)]
+    roof = Surface(ROOF, border, holes)
     found = [roof]
     if detail.dormers:
         for dormer in house.dormers:

@@ -7,7 +7,7 @@ from itertools import islice
 
 import numpy as np
 
-from pipeline.architecture.parameters import House
+from pipeline.architecture.parameters import Flat, House
 from pipeline.architecture.roof_sides import Point
 
 GROUND, WALL, ROOF, WINDOW, DOOR, CLOSURE = (
@@ -71,7 +71,13 @@ def fill_hole(surface: Surface, outer: Sequence[Point], inner: Sequence[Point], 
     return [*sides, Surface(kind, list(inner), [])]
 
 
-def prism(ring: Sequence[tuple[float, float]], low: float, high: float) -> list[Surface]:
+def level_face(kind: str, rings: Sequence[Sequence[Flat]], z: float) -> Surface:
+    """Give a level polygon of a border and courtyards, as of `wall_rings`: it looks down if it is ground."""
+    border, *holes = ([(x, y, z) for x, y in ring[:: -1 if kind == GROUND else 1]] for ring in rings)
+    return Surface(kind, border, holes)
+
+
+def prism(ring: Sequence[Flat], low: float, high: float, holes: Sequence[Sequence[Flat]] = ()) -> list[Surface]:
     """Give the surfaces of a block over an outline: ground, roof and walls.
 
     Parameters
@@ -80,13 +86,16 @@ def prism(ring: Sequence[tuple[float, float]], low: float, high: float) -> list[
         Corners, counter-clockwise from above (m).
     low, high : float
         Heights (m).
+    holes : sequence of rings
+        Courtyards, clockwise.
     """
-    down, up = [(x, y, low) for x, y in ring], [(x, y, high) for x, y in ring]
-    walls = []
-    for k in range(len(ring)):
-        following = (k + 1) % len(ring)
-        walls.append(Surface(WALL, [down[k], down[following], up[following], up[k]], []))
-    return [Surface(GROUND, down[::-1], []), *walls, Surface(ROOF, up, [])]
+    rings = [ring, *holes]
+    walls = [
+        Surface(WALL, [(*one, low), (*other, low), (*other, high), (*one, high)], [])
+        for each in rings
+        for one, other in zip(each, [*each[1:], each[0]], strict=True)
+    ]
+    return [level_face(GROUND, rings, low), *walls, level_face(ROOF, rings, high)]
 
 
 def to_town(house: House, surfaces: Sequence[Surface]) -> list[Surface]:

@@ -1,14 +1,16 @@
 """Degraded twins: a house with noise on its parameters, as acquisition has it, and the same id (paper, 4)."""
 
+import math
 import uuid
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from pipeline.architecture.draw import MARGIN
-from pipeline.architecture.parameters import Chimney, Dormer, House, RoofWindow
-from pipeline.architecture.roof_sides import list_sides
+from pipeline.architecture.parameters import Chimney, Dormer, Flat, House, RoofWindow
+from pipeline.architecture.roof_sides import list_sides, wall_frame
 
 LEAST = 0.5  # share of a length that noise leaves of it
 OnRoof = TypeVar("OnRoof", Dormer, Chimney, RoofWindow)
@@ -42,15 +44,25 @@ def degrade_house(house: House, sigma: float, *, seed: int) -> House:
     x, y, z = (round(value + more, 3) for value, more in zip((house.x, house.y, house.z), noise[:3], strict=True))
     scale = (length / house.length, width / house.width)
     up = height / house.height
+
+    def stretch(wall: int) -> Flat:
+        """How much longer the twin is along a wall, and away from it."""
+        if not house.plan:
+            return scale[wall % 2], scale[1 - wall % 2]
+        _, (u, v) = wall_frame(house, wall)
+        along = math.hypot(u * scale[0], v * scale[1])
+        return along, scale[0] * scale[1] / along
+
     twin = replace(
         house,
         **{"x": x, "y": y, "z": z, "length": length, "width": width, "height": height},
         roof=replace(house.roof, rise=rise),
+        plan=tuple(tuple((x * scale[0], y * scale[1]) for x, y in ring) for ring in house.plan),
         parts=tuple(
             replace(
                 part,
-                along=part.along * scale[part.wall % 2],
-                width=part.width * scale[part.wall % 2],
+                along=part.along * stretch(part.wall)[0],
+                width=part.width * stretch(part.wall)[0],
                 height=part.height * up,
             )
             for part in house.parts
@@ -58,8 +70,8 @@ def degrade_house(house: House, sigma: float, *, seed: int) -> House:
         openings=tuple(
             replace(
                 one,
-                along=one.along * scale[one.wall % 2],
-                width=one.width * scale[one.wall % 2],
+                along=one.along * stretch(one.wall)[0],
+                width=one.width * stretch(one.wall)[0],
                 sill=one.sill * up,
                 height=one.height * up,
             )
@@ -71,18 +83,19 @@ def degrade_house(house: House, sigma: float, *, seed: int) -> House:
     )
     return replace(
         twin,
-        dormers=_move(house.dormers, twin, scale),
-        chimneys=_move(house.chimneys, twin, scale),
-        roof_windows=_move(house.roof_windows, twin, scale),
+        dormers=_move(house.dormers, twin, stretch),
+        chimneys=_move(house.chimneys, twin, stretch),
+        roof_windows=_move(house.roof_windows, twin, stretch),
     )
 
 
-def _move(things: tuple[OnRoof, ...], twin: House, scale: tuple[float, float]) -> tuple[OnRoof, ...]:
+def _move(things: tuple[OnRoof, ...], twin: House, stretch: Callable[[int], Flat]) -> tuple[OnRoof, ...]:
     """Move things to their share of the twin's roof, with their own size; those that fit."""
     kept: list[OnRoof] = []
     sides = {side.wall: side for side in list_sides(twin)}
     for one in things:
-        moved = replace(one, along=one.along * scale[one.side % 2], up=one.up * scale[1 - one.side % 2])
+        along, away = stretch(one.side)
+        moved = replace(one, along=one.along * along, up=one.up * away)
         side = sides[moved.side]
         if isinstance(moved, Dormer):
             deep = (moved.height + moved.rise) / side.slope

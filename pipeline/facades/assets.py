@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import islice, product
 
-from pipeline.architecture.roof_sides import Flat, Point
+from pipeline.architecture.parameters import Flat
+from pipeline.architecture.roof_sides import Point
 from pipeline.architecture.surfaces import DOOR, WALL, WINDOW, Surface, fill_hole, prism
 from pipeline.facades.graph import Insert
 

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.architecture.roof_sides import Flat
+from pipeline.architecture.parameters import Flat
 from pipeline.facades.assets import Made, build, count_steps, least_size, polygons, reach
 from pipeline.facades.graph import ConditionalLod, Graph, Insert, InsertLod, Repeat, Split
 

@@ -76,7 +76,7 @@ ORDER = {
         "serving", "wind", "check", "formats", "convert", "towns", "generalisation", "detail", "interface", "cli",
     ],
     "pipeline": [
-        "data", "geometry", "points_terrain", "generalisation", "architecture", "facades", "skeletons", "roofs",
+        "data", "geometry", "points_terrain", "generalisation", "skeletons", "architecture", "facades", "roofs",
         "city_model",
         "simplification", "plane_mesh", "quality", "smoothing", "columns",
     ],

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from pipeline.architecture.draw import LEAST_RISE, draw_house
 from pipeline.architecture.lots import Lot, lot_random
-from pipeline.architecture.parameters import House
+from pipeline.architecture.parameters import House, Rings
+from pipeline.architecture.roof_sides import list_sides
 from pipeline.architecture.rules import Distribution
-from pipeline.data.errors import InputError
+from pipeline.data.errors import GeometryError, InputError
 from tiler.formats.gpkg import Column, fixed_time, write_rows
 from tiler.towns.synthetic_files import DAY
 
@@ -35,6 +36,8 @@ NAMES = {
 _SHAPES = {"skillion": "shed", **{name: name for name in ("flat", "shed", "gabled", "hipped", "pyramidal")}}
 _WORDS = {"shed": "skillion"}  # of OpenStreetMap, where they are other ones
 RECTANGLE = 0.97  # of the least rectangle around: outlines that fill so much are houses with walls and openings
+STRAIGHT = 0.01  # m, of corners from the wall that they are left out of
+CLEARANCE = 0.03  # m, least one of the sides of a roof, which are rounded to millimetres
 _BESIDE = 0.15  # m from a wall: what lies there shares it
 
 
@@ -53,6 +56,9 @@ class Augmented:
 
 def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augmented:
     """Draw what the attributes of footprints, polygons of a file in a metric CRS, do not say; all are in memory.
+
+    Rectangles are houses with walls and openings; outlines of any form are where the rules have footprints that
+    are no rectangles.
 
     What is drawn depends on `seed`, not negative, the rules, the attributes and the place of a footprint alone.
 
@@ -77,6 +83,7 @@ def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augm
     given = {what: next((table[name] for name in names if name in table), None) for what, names in NAMES.items()}
     tree = shapely.STRtree(outlines)
     counts: Counter[str] = Counter()
+    any_form = rules["footprint"].values != ("rectangle",)
     rows, houses = [], []
     for number, outline in enumerate(outlines.tolist()):
         if outline is None or outline.is_empty or not outline.area > 0:
@@ -85,11 +92,16 @@ def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augm
         name = str(told.pop("id", f"F{number:07d}"))
         drawn = _draw(rules, outline, told, seed)
         rows.append((name, *drawn.describe()))
-        box = shapely.minimum_rotated_rectangle(outline)
-        if outline.geom_type != "Polygon" or outline.area < RECTANGLE * box.area or drawn.shape is None:
+        rectangular = outline.area >= RECTANGLE * shapely.minimum_rotated_rectangle(outline).area
+        if outline.geom_type != "Polygon" or not (rectangular or any_form) or drawn.shape is None:
             counts["footprints that are no rectangles, or have another roof: without walls and openings"] += 1
             continue
-        houses.append(replace(_make_house(rules, outline, drawn, tree, number, seed), id=name))
+        try:
+            house = _make_house(rules, outline, drawn, tree, number, seed, rectangular=rectangular)
+        except GeometryError:
+            counts["footprints whose roof has slivers: without walls and openings"] += 1
+            continue
+        houses.append(replace(house, id=name))
     names = ("id", "height", "building:levels", "roof:shape", "roof:height")
     kinds = (object, np.float64, np.int32, object, np.float64)
     columns = {
@@ -175,9 +187,16 @@ def _draw(rules: Mapping[str, Distribution], outline: Any, told: Mapping[str, An
 
 
 def _make_house(
-    rules: Mapping[str, Distribution], outline: Any, drawn: _Drawn, tree: Any, number: int, seed: int
+    rules: Mapping[str, Distribution],
+    outline: Any,
+    drawn: _Drawn,
+    tree: Any,
+    number: int,
+    seed: int,
+    *,
+    rectangular: bool,
 ) -> House:
-    """Draw parts of the roof and openings of a rectangular outline whose sizes are known."""
+    """Draw parts of the roof and openings of an outline whose sizes are known."""
     corners = shapely.get_coordinates(shapely.orient_polygons(shapely.minimum_rotated_rectangle(outline)))[:4]
     sides = np.diff(corners, axis=0, append=corners[:1])
     lengths = np.hypot(*sides.T)
@@ -191,15 +210,41 @@ def _make_house(
         **{"garage": 0.0, "alcove": 0.0, "overhang": 0.0, "year": drawn.year, "use": drawn.use},
     }
     own = {**rules, **{name: Distribution("constant", (value,)) for name, value in fixed.items()}}
-    order = [(first + k) % 4 for k in range(4)]
-    middles = (corners + np.roll(corners, -1, axis=0))[order] / 2
-    outward = np.column_stack((sides[:, 1], -sides[:, 0]))[order] / lengths[order][:, None]
-    near, wall = tree.query(shapely.points(middles + _BESIDE * outward), "intersects")[::-1]
+    rings = [np.roll(corners, -first, axis=0)] if rectangular else _walls_from_longest(outline)
+    begin = np.concatenate(rings)
+    walls = np.concatenate([np.roll(ring, -1, axis=0) - ring for ring in rings])
+    outward = np.column_stack((walls[:, 1], -walls[:, 0])) / np.hypot(*walls.T)[:, None]
+    # A rectangle shares the walls whose middle another outline touches; others those it touches anywhere.
+    shares = (0.5, 0.5) if rectangular else (0.02, 0.98)
+    ends = [begin + share * walls + _BESIDE * outward for share in shares]
+    near, wall = tree.query(shapely.linestrings(np.stack(ends, axis=1)), "intersects")[::-1]
     shared = {k for other, k in zip(near.tolist(), wall.tolist(), strict=True) if other != number}
     centre = corners.mean(axis=0)
     place = (round(1000 * float(centre[0])), round(1000 * float(centre[1])))
     size = math.hypot(length, width) + 3.0  # that nothing is made smaller
-    rotation = math.degrees(math.atan2(sides[first, 1], sides[first, 0]))
+    rotation = round(math.degrees(math.atan2(sides[first, 1], sides[first, 0])), 3)
+    plan: Rings = ()
+    if not rectangular:
+        turn = math.radians(rotation)
+        axes = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        middle = (round(length, 3) / 2, round(width, 3) / 2)
+        local = [np.round((ring - centre) @ axes + middle, 6).tolist() for ring in rings]
+        plan = tuple(tuple((x, y) for x, y in ring) for ring in local)
     lot = Lot(*place, float(centre[0]), float(centre[1]), size, rotation)
-    house = draw_house(own, lot, lambda x, y: drawn.ground, seed=seed)
+    rise = None if rectangular else round(drawn.rise, 3)
+    house = draw_house(own, lot, lambda x, y: drawn.ground, seed=seed, plan=plan, rise=rise)
+    if plan and min(shapely.minimum_clearance(side.polygon) for side in list_sides(house)) < CLEARANCE:
+        raise GeometryError(f"house {house.id}: a side of its roof is narrower than {CLEARANCE:g} m")
     return replace(house, openings=tuple(one for one in house.openings if one.wall not in shared))
+
+
+def _walls_from_longest(outline: shapely.Polygon) -> list[NDArray[np.float64]]:
+    """Corners (m): of the border counter-clockwise from its longest outer wall, of courtyards clockwise."""
+    plain = shapely.orient_polygons(shapely.simplify(outline, STRAIGHT))
+    border, *holes = (shapely.get_coordinates(ring)[:-1] for ring in (plain.exterior, *plain.interiors))
+    walls = np.roll(border, -1, axis=0) - border
+    long = np.hypot(*walls.T)
+    across = border[None] - border[:, None]  # from the start of each wall to each corner
+    inwards = (walls[:, None, 0] * across[..., 1] - walls[:, None, 1] * across[..., 0]) / long[:, None]
+    outer = (inwards > -STRAIGHT).all(axis=1)
+    return [np.roll(border, -int(np.argmax(np.round(long, 3) + 1e6 * outer)), axis=0), *holes]

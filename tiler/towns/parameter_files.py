@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 from xml.sax.saxutils import escape
 
+import shapely
 from lxml import etree
 
-from pipeline.architecture.parameters import House
+from pipeline.architecture.parameters import House, Rings
 from pipeline.data.errors import InputError
 
 # What the paper's XML calls them; all others are named as here.
@@ -66,13 +67,26 @@ def _make(kind: Any, values: Any) -> Any:
     found = {}
     for name, value in values.items():
         hint = hints[name]
-        if isinstance(value, list):
+        if name == "plan":
+            found[name] = _read_plan(value)
+        elif isinstance(value, list):
             found[name] = tuple(_make(get_args(hint)[0], item) for item in value)
         elif isinstance(value, dict):
             found[name] = _make(hint, value)
         else:
             found[name] = _take(hint, name, value)
     return kind(**found)
+
+
+def _read_plan(rings: Any) -> Rings:
+    """Read an outline with its courtyards; ValueError where it is none, or turns the wrong way."""
+    plan = tuple(tuple((float(x), float(y)) for x, y in ring) for ring in rings)
+    outline = shapely.Polygon(plan[0], plan[1:])
+    if not outline.is_valid or not outline.area > 0:
+        raise ValueError(f"plan: {shapely.is_valid_reason(outline)}")
+    if not outline.exterior.is_ccw or any(ring.is_ccw for ring in outline.interiors):
+        raise ValueError("plan: its border has to be counter-clockwise, its courtyards clockwise")
+    return plan
 
 
 def _take(hint: Any, name: str, value: Any) -> Any:
@@ -87,7 +101,10 @@ def _take(hint: Any, name: str, value: Any) -> Any:
 def _values_of(house: House) -> dict[str, Any]:
     """Give what `dataclasses.asdict` gives, without copies: in a tenth of the time."""
     lists = {name: [vars(one) for one in getattr(house, name)] for name in _LISTS}
-    return vars(house) | {"roof": vars(house.roof)} | lists
+    values = vars(house) | {"roof": vars(house.roof)} | lists
+    if not house.plan:
+        del values["plan"]
+    return values
 
 
 def house_xml(house: House) -> str:
@@ -95,7 +112,9 @@ def house_xml(house: House) -> str:
     values = _values_of(house)
     x, y, z = (values.pop(name) for name in ("x", "y", "z"))
     name = values.pop("id")
-    rows = [f"    <origin>{x!r} {y!r} {z!r}</origin>\n"]
+    form = "Polygon" if house.plan else "Rectangular"
+    rings = (" ".join(repr(value) for corner in ring for value in corner) for ring in values.pop("plan", ()))
+    rows = [f"    <origin>{x!r} {y!r} {z!r}</origin>\n", *(f"    <ring>{ring}</ring>\n" for ring in rings)]
     for key, value in values.items():
         if key in _LISTS:
             rows += [f"    <{_LISTS[key]}>\n{_rows(item, 6)}    </{_LISTS[key]}>\n" for item in value]
@@ -103,9 +122,7 @@ def house_xml(house: House) -> str:
             rows.append(f"    <{key}>\n{_rows(value, 6)}    </{key}>\n")
         else:
             rows.append(_row(key, value, 4))
-    return (
-        f'  <building ID="{escape(name)}">\n    <footprint>Rectangular</footprint>\n{"".join(rows)}  </building>\n'
-    )
+    return f'  <building ID="{escape(name)}">\n    <footprint>{form}</footprint>\n{"".join(rows)}  </building>\n'
 
 
 def _rows(values: dict[str, Any], indent: int) -> str:
@@ -125,6 +142,10 @@ def _house_values(element: Any) -> dict[str, Any]:
     hints = get_type_hints(House)
     for child in element:
         if child.tag in ("footprint", "origin"):
+            continue
+        if child.tag == "ring":
+            numbers = (child.text or "").split()
+            found.setdefault("plan", []).append(list(zip(numbers[::2], numbers[1::2], strict=True)))
             continue
         if child.tag in lists:
             name = lists[child.tag]

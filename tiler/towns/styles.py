@@ -37,6 +37,7 @@ STYLES = {
     "blocks": Style("terraces", "blocks", 10.0),
     "apartments": Style("apartments", "random", 60.0),
     "towers": Style("towers", "grid", 55.0),
+    "wings": Style("wings", "random", 44.0),
 }
 
 

@@ -195,12 +195,12 @@ class _OpenTown:
     crs: str
     houses: int = 0
 
-    def append_footprints(self, rows: Sequence[tuple[str, float, list[list[float]]]]) -> None:
+    def append_footprints(self, rows: Sequence[tuple[str, float, list[list[list[float]]]]]) -> None:
         """Append outlines with id and height; a file without any is written, too."""
         there = self.footprints.exists()
         if not rows and there:
             return
-        polygons = np.array([shapely.Polygon(ring) for *_, ring in rows], object)
+        polygons = np.array([shapely.Polygon(border, holes) for *_, (border, *holes) in rows], object)
         columns: dict[str, Column] = {
             "id": (np.array([name for name, *_ in rows], object), None),
             "height": (np.array([height for _, height, _ in rows], np.float64), None),

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.architecture.levels import at_eaves, make_level, outline_ring, part_ring
+from pipeline.architecture.levels import at_eaves, make_level, outline_rings, part_ring
 from pipeline.architecture.parameters import House
 from pipeline.architecture.plants import Tree
 from pipeline.architecture.scanner import (
@@ -215,8 +215,8 @@ def describe_truth(house: House) -> dict[str, Any]:
         "ground": house.z,
         "eaves": round(house.z + house.height, 3),
         "ridge": round(house.z + house.height + house.roof.rise, 3),
-        "outline": _ring(house, outline_ring(house), 0.0),
-        "roof_outline": _ring(outer, outline_ring(outer), 0.0),
+        "outline": _ring(house, outline_rings(house)[0], 0.0),
+        "roof_outline": _ring(outer, outline_rings(outer)[0], 0.0),
         "parts": [
             {"kind": part.kind, "outline": _ring(house, part_ring(house, part), 0.0), "height": part.height}
             for part in house.parts

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.architecture.levels import Footprint, outline_ring
+from pipeline.architecture.levels import Footprint, outline_rings
 from pipeline.architecture.parameters import House
 from pipeline.architecture.representations import Representation
-from pipeline.architecture.surfaces import GROUND, Surface, to_town
+from pipeline.architecture.surfaces import ROOF, level_face, to_town
 from pipeline.architecture.twins import degrade_house
 from tiler.towns.parameter_files import house_json, house_xml
 from tiler.towns.styles import Box, Town
@@ -126,8 +126,8 @@ def write_tile(tile: TownTile) -> int:
     return len(own)
 
 
-def house_outline(house: House) -> tuple[float, list[list[float]]]:
-    """Height from the ground to the ridge, and outline with parts (m)."""
-    ring = [(x, y, 0.0) for x, y in outline_ring(house)]
-    (placed,) = to_town(house, [Surface(GROUND, ring, [])])
-    return round(house.height + house.roof.rise, 3), [list(corner[:2]) for corner in placed.border]
+def house_outline(house: House) -> tuple[float, list[list[list[float]]]]:
+    """Height from the ground to the ridge, and rings of the outline with parts (m): border, then courtyards."""
+    (placed,) = to_town(house, [level_face(ROOF, outline_rings(house), 0.0)])
+    rings = [[list(corner[:2]) for corner in ring] for ring in (placed.border, *placed.holes)]
+    return round(house.height + house.roof.rise, 3), rings

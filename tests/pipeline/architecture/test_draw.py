@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from pipeline.architecture.draw import MARGIN, draw_house
-from pipeline.architecture.levels import outline_ring
+from pipeline.architecture.levels import outline_rings
 from pipeline.architecture.lots import list_lots
 from pipeline.architecture.parameters import House
 from pipeline.architecture.roof_sides import list_sides, wall_length
@@ -19,6 +19,7 @@ LAYOUTS = {
     "blocks": ("blocks", 10.0),
     "apartments": ("random", 60.0),
     "towers": ("grid", 55.0),
+    "wings": ("random", 44.0),
 }
 
 
@@ -33,7 +34,7 @@ def town(preset: str, bounds: tuple[float, float, float, float], **rules: object
 
 
 def outline(house: House) -> shapely.Polygon:
-    ring = [(x, y, 0.0) for x, y in outline_ring(house)]
+    ring = [(x, y, 0.0) for x, y in outline_rings(house)[0]]
     return shapely.Polygon([place[:2] for place in to_town(house, [Surface(GROUND, ring, [])])[0].border])
 
 

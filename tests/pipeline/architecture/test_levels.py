@@ -11,7 +11,7 @@ import shapely
 
 from pipeline.architecture.draw import draw_house
 from pipeline.architecture.heights import house_heights
-from pipeline.architecture.levels import FOOTPRINTS, LEVELS, TOPS, Volume, at_eaves, make_level, outline_ring
+from pipeline.architecture.levels import FOOTPRINTS, LEVELS, TOPS, Volume, at_eaves, make_level, outline_rings
 from pipeline.architecture.lots import Lot, list_lots
 from pipeline.architecture.parameters import (
     ROOF_SHAPES,
@@ -171,7 +171,7 @@ def test_an_outline_has_the_area_of_body_and_parts() -> None:
     house = plain(
         parts=(BuildingPart("garage", 1, 1.0, 4.0, 3.0, 2.8), BuildingPart("alcove", 2, 3.0, 3.0, 1.5, 2.8))
     )
-    assert shapely.Polygon(outline_ring(house)).area == pytest.approx(12 * 8 + 4 * 3 + 3 * 1.5)
+    assert shapely.Polygon(outline_rings(house)[0]).area == pytest.approx(12 * 8 + 4 * 3 + 3 * 1.5)
 
 
 @pytest.mark.parametrize("words", [("2.4", "walls", "half"), ("2.0", "roof", "half"), ("1.0", "walls", "attic")])

@@ -64,6 +64,17 @@ def test_attributes_win_over_rules(tmp_path: Path, capsys: pytest.CaptureFixture
         document = read_document(tmp_path / f"t/{model}.city.jsonl")
         assert list(document["CityObjects"]) == ["a", "b"]
         assert not any(check_solids(document, ("1.2", "2.2")).values())
+    # Rules that have other footprints than rectangles make a house of the L, too.
+    (tmp_path / "rules.toml").write_text('footprint = "L"\nroof_shape = "gabled"')
+    wings = ["--footprints", str(tmp_path / "f.gpkg"), "--rules", str(tmp_path / "rules.toml")]
+    assert main(["synth", str(tmp_path / "w"), *style, *wings]) == 0
+    (*same, c) = read_json(tmp_path / "w/parameters.jsonl")
+    assert [one.id for one in same] == ["a", "b"]
+    outline = shapely.from_wkb(pyogrio.raw.read(tmp_path / "w/footprints.gpkg")[2][2])
+    assert outline.symmetric_difference(translate(RING, 500_040, 6_000_000)).area < 0.05
+    assert (c.roof.shape, {one.wall for one in c.openings}) == ("gabled", set(range(6)))
+    found = check_solids(read_document(tmp_path / "w/town.city.jsonl"), ("1.2", "2.2"))
+    assert found["c", "2.2"] == found["c", "1.2"] == set()
     broken = check_solids(read_document(tmp_path / "t/broken.city.jsonl"), ("1.2",))
     assert len(broken) == 19
     assert all(broken.values())

@@ -120,6 +120,8 @@ def test_parameters_are_read_back(tmp_path: Path, style: str) -> None:
         ({"colour": "red"}, "House has no 'colour'"),
         ({"roof": {"shape": "onion"}}, "shape is 'onion'"),
         ({"dormers": [{"side": True}]}, "side is True"),
+        ({"plan": [[[0, 0], [6, 0], [6, 5], [3, -1]]]}, "plan: Self-intersection"),
+        ({"plan": [[[0, 0], [0, 4], [4, 4]]]}, "plan: its border has to be counter-clockwise"),
     ],
 )
 def test_wrong_parameters_are_told_with_their_line(tmp_path: Path, change: dict[str, Any], told: str) -> None:
