@@ -1,15 +1,18 @@
 """Tiled runs as a whole: tiles depend on their halo alone and on no order, the city model on no tiles."""
 
+import os
 import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 import shapely
 from shapely import affinity
 
+from pipeline.data.classes import BUILDING
 from pipeline.data.mesh import Marker
 from stitch.seams.tiles import tile_halo
 from tests.helpers.campaigns import keep_outcome, rounds
@@ -36,6 +39,7 @@ from tests.helpers.tiles import (
 from tiler.config.config import make_config
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.vtk_files import read_vtp
+from tiler.pointclouds import clouds, las_chunks
 from tiler.stages.surroundings import terrain_halo
 from tiler.store.store import Store
 
@@ -50,6 +54,36 @@ def reach_of(values: dict[str, Any]) -> float:
     config = make_config(values)
     halo = tile_halo(config.tile_size, config.mesh_size)
     return (halo + max(terrain_halo(config), 50.0)) / config.tile_size
+
+
+def test_a_file_read_in_shares_is_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Buildings are marked in the first shares of a file alone, and a damaged share takes the file with it."""
+    region = box(2 * SIZE, SIZE)
+    values = write_town(tmp_path / "city", make_town(region, terraces(region, seed=2), relief=3), files=(2, 1))
+    for path in (tmp_path / "city" / "tiles").iterdir():
+        las = laspy.read(path)
+        above = np.flatnonzero(las.classification == BUILDING)[::3]  # a roof, if the file marked none
+        las.classification[above], las.z[above] = 1, las.z[above] + 4
+        las.points = las.points[np.argsort(-np.array(las.classification, int), kind="stable")]
+        las.write(path.with_suffix(".las"))
+        path.unlink()
+        if path.stem == "1_0":  # the last point lies 100 km away, which the header does not say
+            with path.with_suffix(".las").open("r+b") as file:
+                file.seek(-las.point_format.size, os.SEEK_END)
+                file.write((10_000_000).to_bytes(4, "little"))
+    values |= {"tile_size": SIZE, "skip_unreadable": True, "bounds": region}
+    whole = run_of(values, tmp_path / "whole")
+    monkeypatch.setattr(clouds, "SHARE_POINTS", 5000)
+    monkeypatch.setattr(las_chunks, "SOME_POINTS", 1000)
+    shared = run_of(values, tmp_path / "shared")
+    assert len(Store(tmp_path / "shared" / "store.zarr").names("points")) == 8
+    assert shared["unreadable"].keys() == whole["unreadable"].keys() != set()
+    assert shared["counts"] == whole["counts"]
+    found, expected = (
+        hash_files(tmp_path / name, besides=lambda path: "store.zarr" in path.parts)
+        for name in ("shared", "whole")
+    )
+    assert found == expected
 
 
 @pytest.mark.parametrize(("mesher", "simplify"), [WAYS[0], pytest.param(*WAYS[3], marks=pytest.mark.long)])

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tiler.engine.stage import Box, Layout, Scope, Stage
+from tiler.engine.stage import WHOLE, Box, Layout, Scope, Share, Stage
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.store.store import Store
 
@@ -159,16 +159,16 @@ def declared_values(stage: Stage, parameters: Any) -> dict[str, Any]:
     return {name: getattr(parameters, name) for name in sorted(stage.parameters)}
 
 
-def file_identity(layout: Layout, scope: Scope, name: str) -> tuple[str, str, Frame]:
-    """Give path, identity and frame of a file item; those of none for other scopes.
+def file_identity(layout: Layout, scope: Scope, name: str) -> tuple[str, str, Frame, Share]:
+    """Give path, identity, frame and share of a file item; those of none for other scopes.
 
-    The frame is part of the identity, unless coordinates are taken as they are.
+    The frame is part of the identity, unless coordinates are taken as they are; so is the share, unless it is all.
     """
     if scope is not Scope.FILE:
-        return "", "", AS_IT_IS
+        return "", "", AS_IT_IS, WHOLE
     item = layout.files[name]
     framed = item.identity if item.frame == AS_IT_IS else f"{item.identity} {item.frame}"
-    return item.path, framed, item.frame
+    return item.path, framed if item.share == WHOLE else f"{framed} {item.share}", item.frame, item.share
 
 
 @cache

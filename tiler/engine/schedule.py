@@ -194,7 +194,7 @@ class Schedule:
         """
         engine, planned = self.engine, self.plan[self.rank[ticket]]
         scope, (stage, name) = planned.stage.scope, self._item(ticket)
-        path, identity, frame = file_identity(engine.layout, scope, name)
+        path, identity, frame, share = file_identity(engine.layout, scope, name)
         xmin, ymin, xmax, ymax = planned.items.boxes[ticket - planned.first].tolist()
         box = (xmin, ymin, xmax, ymax)
 
@@ -211,7 +211,7 @@ class Schedule:
         key = None if made.awaited() else made.close({}, engine.store)[0]
         task = Task(
             *(stage, name, scope, box, planned.parameters, engine.context, path, engine.store, refs, key or ""),
-            *(engine.store.path.parent, frame),
+            *(engine.store.path.parent, frame, share),
             former="" if key is None else self._former_key(planned.stage, made),
         )
         return Part(planned.stage.function, task, made if key is None else None)
@@ -336,7 +336,7 @@ class Schedule:
             engine.watcher.failed(stage.name, name, reason, ends_run=True)
             raise _named(failure.error, stage, name)
         refs, _ = self._find_reads(ticket, {})
-        path, _, _ = file_identity(engine.layout, stage.scope, name)
+        path, *_ = file_identity(engine.layout, stage.scope, name)
         engine.set_aside[stage.name, name] = SetAside(
             stage.name, name, stage.scope, failure.kind, reason, failure.trace, self.tried[ticket], refs, path
         )

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float]
 Facts = dict[str, Any]
+Share = tuple[int, int]
+
+WHOLE: Share = 0, 1  # the only one of a file
 
 REGION_ITEM = "region"
 
@@ -119,7 +122,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class FileItem:
-    """An input file.
+    """An input file, or a share of one.
 
     Attributes
     ----------
@@ -131,12 +134,26 @@ class FileItem:
         Changes when the content does: path, size and time of change, say.
     frame : Frame
         How its coordinates become those of the region.
+    share : (int, int)
+        Which of the equal shares of its points it has, and of how many; each is a task of its own.
     """
 
     path: str
     box: Box
     identity: str
     frame: Frame = AS_IT_IS
+    share: Share = WHOLE
+
+
+def whole_file(name: str) -> str:
+    """Name of the file that an item is a share of: what is before a full stop.
+
+    Examples
+    --------
+    >>> whole_file("tile.03"), whole_file("tile")
+    ('tile', 'tile')
+    """
+    return name.partition(".")[0]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.data.errors import CityError
 from pipeline.data.notes import Note, count_notes
-from tiler.engine.stage import Box, Facts, Scope
+from tiler.engine.stage import WHOLE, Box, Facts, Scope, Share
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.requests import trust_addresses
 from tiler.objects.results import files_for
@@ -141,6 +141,8 @@ class Task:
         Where the files are that results state as the fact ``"files"``.
     frame : Frame
         How coordinates of the file become those of the region, for the scope FILE.
+    share : (int, int)
+        Which of the equal shares of the file's points it is for, and of how many.
     former : str
         Key that the same result has in a copied store, before changes that do not reach it; empty for none.
     """
@@ -157,6 +159,7 @@ class Task:
     key: str
     folder: Path
     frame: Frame = AS_IT_IS
+    share: Share = WHOLE
     former: str = ""
     _writer: Writer | None = None
     _notes: list[Note] = field(default_factory=list)

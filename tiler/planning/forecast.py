@@ -21,7 +21,7 @@ from tiler.planning.footprint_sample import FootprintSample
 from tiler.planning.own_stages import list_stages, stages_of_pad
 from tiler.planning.plan import Survey
 from tiler.planning.refinements import read_refinements
-from tiler.pointclouds.clouds import CloudHeader
+from tiler.pointclouds.clouds import CloudHeader, count_shares
 
 # Measured on synthetic cities and Amsterdam with mesh sizes of 4 to 20 m: see docs/plan.md.
 TRIANGLES = 3.07  # on open ground, in one squared mesh size
@@ -134,7 +134,9 @@ def forecast_run(
 def count_tasks(survey: Survey, config: Config) -> list[Tasks]:
     """Count the tasks of each stage of a run whose clusters are joined in one later round at most."""
     wide = stages_of_pad(config)
-    core, both = (_count_items(grid, len(survey.clouds)) for grid in (survey.grid, survey.meshed))
+    core, both = (
+        _count_items(grid, sum(map(count_shares, survey.clouds))) for grid in (survey.grid, survey.meshed)
+    )
     return [
         Tasks(stage.name, stage.scope, (both if stage.name in wide else core)[stage.scope])
         for stage in list_stages(config)

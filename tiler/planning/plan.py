@@ -41,7 +41,7 @@ from tiler.planning.region import (
     describe_pad,
     foresee_pad,
 )
-from tiler.pointclouds.clouds import CloudHeader, find_clouds, read_header
+from tiler.pointclouds.clouds import CloudHeader, count_shares, find_clouds, read_header
 from tiler.vectors.layers import describe_layer
 
 
@@ -194,10 +194,15 @@ def _describe_inexact(operation: Operation, subject: str, config: Config) -> str
 
 
 def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
-    """Name files by their stem, those of one stem by a number behind it."""
-    items: dict[str, FileItem] = {}
+    """Name files by their stem, those of one stem by a number behind it, and shares by one behind a full stop."""
+    items, taken = dict[str, FileItem](), set[str]()
     for header in clouds:
         stem = re.sub(r"[^\w-]", "_", header.path.stem)
-        name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in items)
-        items[name] = FileItem(str(header.path), header.bounds[:4], identify_file(header), header.frame)
+        name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in taken)
+        taken.add(name)
+        n = count_shares(header)
+        for k in range(n):
+            share = name if n == 1 else f"{name}.{k:0{len(str(n - 1))}d}"
+            whole = str(header.path), header.bounds[:4], identify_file(header), header.frame
+            items[share] = FileItem(*whole, (k, n))
     return items

@@ -16,6 +16,8 @@ from tiler.pointclouds.las_chunks import SLACK, box_of_points
 from tiler.pointclouds.las_header import box_of_header, read_las_header
 from tiler.store.remembered import remember
 
+# Points that a task reads of a larger file: some seconds, many of those of a task, and few enough for all workers.
+SHARE_POINTS = 3_000_000
 _SUFFIXES = {".las", ".laz"}
 _GLOB_SIGNS = set("*?[")
 
@@ -101,6 +103,11 @@ def is_pattern(source: Path) -> bool:
 def each_once(files: Iterable[Path]) -> list[Path]:
     """Sort files; of those that are one by symbolic links the first name counts."""
     return sorted({path.resolve(): path for path in sorted(files, reverse=True)}.values())
+
+
+def count_shares(header: CloudHeader) -> int:
+    """Count the tasks that read a file: workers share the points of a large one."""
+    return max(1, round(header.n_points / SHARE_POINTS)) if header.kind == "cloud" else 1
 
 
 def read_header(path: str | Path) -> CloudHeader:

@@ -13,7 +13,7 @@ from pipeline.points_terrain.las_points import KEPT, REASONS, Triple, count_valu
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.places import as_place
 from tiler.pointclouds.cells import Box, order_by_cell
-from tiler.pointclouds.las_chunks import PointChunk, coordinates_of, nodes_near, read_chunks
+from tiler.pointclouds.las_chunks import PointChunk, nodes_near, plan_of, read_chunks, take_share
 from tiler.pointclouds.las_header import read_las_header
 
 COUNTED = ("read", "outside", "withheld", "noise", "absurd", "kept")
@@ -49,7 +49,7 @@ class PointBlock:
 
 
 def read_cells(
-    path: str | Path, bounds: Box, *, size: float = CELL, frame: Frame = AS_IT_IS
+    path: str | Path, bounds: Box, *, size: float = CELL, frame: Frame = AS_IT_IS, share: tuple[int, int] = (0, 1)
 ) -> Iterator[PointBlock]:
     """Read the usable points of a file within a box, dealt out to cells (step 1.1).
 
@@ -63,6 +63,8 @@ def read_cells(
         Side of a cell (m); cells have their corners at multiples of it.
     frame : Frame
         How coordinates of the file become those of the region.
+    share : (int, int)
+        Which of how many equal shares of its points, in the order of the file: whole chunks of a LAZ file.
 
     Yields
     ------
@@ -90,15 +92,15 @@ def read_cells(
     path = as_place(path)
     header = read_las_header(path)
     nodes = nodes_near(path, header, bounds, frame)
-    n_skipped = 0 if nodes is None else header.point_count - int(nodes.count.sum())
+    n_skipped = 0 if nodes is None or share[0] else header.point_count - int(nodes.count.sum())
     total: Counter[tuple[int, int]] = Counter()
-    for chunk in read_chunks(path, header, nodes, frame):
+    for chunk in read_chunks(path, header, take_share(path, header, nodes, share), frame):
         counts = dict.fromkeys(COUNTED, 0)
         kept = select_usable(chunk, bounds, counts)
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
         n_skipped = 0
-        found = order_by_cell(coordinates_of(chunk), float(size), among=kept)
+        found = order_by_cell(plan_of(chunk).T, float(size), among=kept)
         total.update(dict(zip(map(tuple, found.cell.tolist()), np.diff(found.start).tolist(), strict=True)))
         _check_density(path, total, size)
         units = np.column_stack([chunk.x, chunk.y, chunk.z]).take(found.order, axis=0)

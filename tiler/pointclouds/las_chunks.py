@@ -20,6 +20,7 @@ from tiler.objects.places import source_of
 from tiler.pointclouds.las_header import AGAIN, Box3, box_of_header, has_void_box, laspy_as_input_error
 
 CHUNK_POINTS = 1_000_000
+SOME_POINTS = 50_000  # that count as a chunk where a file has none
 CHUNK_BYTES = 64_000_000  # wins over CHUNK_POINTS where a point has many extra bytes
 SLACK = (
     1.0  # m that a point may lie outside the header's box or its COPC node, or a node outside the octree's cube
@@ -40,7 +41,6 @@ MOST_LEVELS = 32
 _MANY_BYTES = 2**30  # of one COPC node, uncompressed; writers put some 10^5 points of 30 to 60 bytes there
 
 Box = tuple[float, float, float, float]
-Record = tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64] | None]  # points, and the box of each one's node
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +62,14 @@ class PointChunk:
         return len(self.x)
 
 
+BoxedChunk = tuple[PointChunk, NDArray[np.float64] | None]  # and the box of each point's node, if known
+
+
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Nodes of a COPC file that hold points, in the order of the file."""
+    """Nodes of a COPC file that hold points, in the order of the file; or chunks of any other file."""
 
-    box: NDArray[np.float64]  # (n, 4): xmin, ymin, xmax, ymax in the file's CRS
+    box: NDArray[np.float64] | None  # (n, 4): xmin, ymin, xmax, ymax in the file's CRS; None where unknown
     offset: NDArray[np.int64]  # (n,): first byte of the node's points
     size: NDArray[np.int64]  # (n,): how many bytes
     count: NDArray[np.int64]  # (n,): how many points
@@ -86,9 +89,48 @@ def nodes_near(path: Path, header: laspy.LasHeader, bounds: Box, frame: Frame = 
     nodes = read_octree(path, header) if covered < QUERY_SHARE * (x1 - x0) * (y1 - y0) else None
     if nodes is None:
         return None
+    assert nodes.box is not None
     low_x, low_y, high_x, high_y = nodes.box.T
     near = (low_x <= xmax + SLACK) & (high_x >= xmin - SLACK) & (low_y <= ymax + SLACK) & (high_y >= ymin - SLACK)
-    return Nodes(nodes.box[near], nodes.offset[near], nodes.size[near], nodes.count[near])
+    return _take_nodes(nodes, near)
+
+
+def _take_nodes(nodes: Nodes, rows: NDArray[np.bool_]) -> Nodes:
+    box = None if nodes.box is None else nodes.box[rows]
+    return Nodes(box, nodes.offset[rows], nodes.size[rows], nodes.count[rows])
+
+
+def take_share(path: Path, header: laspy.LasHeader, nodes: Nodes | None, share: tuple[int, int]) -> Nodes | None:
+    """Take one of equal shares of the points of some nodes, by default of the whole file, by its chunk table.
+
+    Each node or chunk is in the share that has its first point.
+    """
+    if share == (0, 1) or header.point_count == 0:
+        return nodes
+    if nodes is None:
+        nodes = _list_chunks(path, header)
+    first = np.cumsum(nodes.count) - nodes.count
+    return _take_nodes(nodes, first * share[1] // max(int(nodes.count.sum()), 1) == share[0])
+
+
+def _list_chunks(path: Path, header: laspy.LasHeader) -> Nodes:
+    """List the chunks of a LAZ file; those of an uncompressed one have some points each."""
+    n, begin = header.point_count, header.offset_to_point_data
+    if header.are_points_compressed:
+        with laspy_as_input_error(path, lambda: "its chunk table cannot be read"), path.open("rb") as file:
+            file.seek(begin)
+            table = lazrs.read_chunk_table(file, lazrs.LazVlr(_zip_record(header)))
+            count, size = np.array(table, np.int64).reshape(-1, 2).T
+            begin += 8  # the place of the table itself
+        count = np.minimum(count, n - (np.cumsum(count) - count))  # the last chunk is not full
+    else:
+        count = np.diff(np.append(np.arange(0, n, SOME_POINTS), n))
+        size = count * int(header.point_format.size)
+    return Nodes(None, begin + np.cumsum(size) - size, size, count)
+
+
+def _zip_record(header: laspy.LasHeader) -> bytes:
+    return bytes(next(one for one in header.vlrs if isinstance(one, LasZipVlr)).record_data)
 
 
 def read_octree(path: Path, header: laspy.LasHeader) -> Nodes | None:
@@ -177,9 +219,8 @@ def _read(path: Path, header: laspy.LasHeader, nodes: Nodes | None) -> Iterator[
         return
     n_read, header_box = 0, np.concatenate([header.mins[:2], header.maxs[:2]])
     with laspy_as_input_error(path, lambda: f"{n_read} of {header.point_count} points could be read"):
-        for record, box in _all_records(path, header) if nodes is None else _node_records(path, header, nodes):
-            n_read += len(record)
-            chunk = take_chunk(record)
+        for chunk, box in _all_chunks(path, header) if nodes is None else _node_chunks(path, header, nodes):
+            n_read += len(chunk)
             if not has_void_box(header):
                 _check_within(path, chunk, header_box, "the bounds in its header")
             if box is not None:
@@ -193,33 +234,44 @@ def _step(header: laspy.LasHeader) -> int:
     return max(1, min(CHUNK_POINTS, CHUNK_BYTES // int(header.point_format.size)))
 
 
-def _all_records(path: Path, header: laspy.LasHeader) -> Iterator[Record]:
+def _all_chunks(path: Path, header: laspy.LasHeader) -> Iterator[BoxedChunk]:
     with laspy.open(
         source_of(path), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, decompression_selection=FIELDS
     ) as reader:
-        for record in reader.chunk_iterator(_step(header)):
-            yield record, None
+        for chunk in map(take_chunk, reader.chunk_iterator(_step(header))):
+            yield chunk, None
 
 
-def _node_records(path: Path, header: laspy.LasHeader, nodes: Nodes) -> Iterator[Record]:
-    """Yield as many nodes as have some million points, or one; with the box of each point's node.
+def _node_chunks(path: Path, header: laspy.LasHeader, nodes: Nodes) -> Iterator[BoxedChunk]:
+    """Yield as many nodes as have some million points, or one; with the box of each point's node, if known.
 
     `laspy.LasReader.seek` would give other points: it takes each chunk for one of fixed size.
     """
-    zipped = next(one for one in header.vlrs if isinstance(one, LasZipVlr)).record_data
     batch = (np.cumsum(nodes.count) - nodes.count) // _step(header)
     with path.open("rb") as file:
         for part in np.split(np.arange(len(batch)), np.flatnonzero(np.diff(batch)) + 1):
-            count, size = nodes.count[part], nodes.size[part]
-            blobs = [
-                _read_bytes(file, *place) for place in zip(nodes.offset[part].tolist(), size.tolist(), strict=True)
-            ]
-            raw = np.zeros(int(count.sum()) * header.point_format.size, np.uint8)
-            table = list(zip(count.tolist(), size.tolist(), strict=True))
-            lazrs.decompress_points_with_chunk_table(b"".join(blobs), zipped, raw, table, FIELDS.to_lazrs())
-            packed = laspy.PackedPointRecord.from_buffer(raw, header.point_format)
-            record = laspy.ScaleAwarePointRecord(packed.array, packed.point_format, header.scales, header.offsets)
-            yield record, np.repeat(nodes.box[part], count, axis=0)
+            box = None if nodes.box is None else np.repeat(nodes.box[part], nodes.count[part], axis=0)
+            yield _read_nodes(file, header, nodes.offset[part], nodes.size[part], nodes.count[part]), box
+
+
+def _read_nodes(
+    file: BinaryIO,
+    header: laspy.LasHeader,
+    offset: NDArray[np.int64],
+    size: NDArray[np.int64],
+    count: NDArray[np.int64],
+) -> PointChunk:
+    """Read nodes that follow each other in the file; each has a first byte, bytes and points."""
+    blobs = [_read_bytes(file, *place) for place in zip(offset.tolist(), size.tolist(), strict=True)]
+    raw = np.frombuffer(b"".join(blobs), np.uint8)
+    if header.are_points_compressed:
+        zipped, raw = raw, np.zeros(int(count.sum()) * header.point_format.size, np.uint8)
+        table = list(zip(count.tolist(), size.tolist(), strict=True))
+        lazrs.decompress_points_with_chunk_table(zipped, _zip_record(header), raw, table, FIELDS.to_lazrs())
+    packed = laspy.PackedPointRecord.from_buffer(raw, header.point_format)
+    return take_chunk(
+        laspy.ScaleAwarePointRecord(packed.array, packed.point_format, header.scales, header.offsets)
+    )
 
 
 def _read_bytes(file: BinaryIO, place: int, size: int) -> bytes:
@@ -229,14 +281,12 @@ def _read_bytes(file: BinaryIO, place: int, size: int) -> bytes:
 
 def _check_within(path: Path, chunk: PointChunk, box: NDArray[np.float64], place: str) -> None:
     """Refuse points outside a box, or each its own: laspy gives them, and tiles are planned without them."""
-    xy = coordinates_of(chunk)[:, :2]
-    (x, y), (xmin, ymin, xmax, ymax) = xy.T, box.T
+    (x, y), (xmin, ymin, xmax, ymax) = plan_of(chunk), box.T
     stray = (x < xmin - SLACK) | (x > xmax + SLACK) | (y < ymin - SLACK) | (y > ymax + SLACK)
     if stray.any():
-        x, y = xy[stray][0]
         raise InputError(
-            f"{path}: {np.count_nonzero(stray)} of {len(xy)} points lie more than {SLACK:g} m outside {place}, "
-            f"the first at ({x:.2f}, {y:.2f}): the file is damaged; {AGAIN}, or rewrite it: "
+            f"{path}: {np.count_nonzero(stray)} of {len(x)} points lie more than {SLACK:g} m outside {place}, "
+            f"the first at ({x[stray][0]:.2f}, {y[stray][0]:.2f}): the file is damaged; {AGAIN}, or rewrite it: "
             f"pdal translate {path.name} plain.laz"
         )
 
@@ -252,14 +302,20 @@ def take_chunk(record: laspy.ScaleAwarePointRecord) -> PointChunk:
     classes[key] = GROUND
     (a, b, c), (x, y, z) = record.scales.tolist(), record.offsets.tolist()
     withheld = np.asarray(np.asarray(record.withheld) != 0)
-    return PointChunk(
-        record.X, record.Y, record.Z, (a, b, c), (x, y, z), classes, withheld, int(np.count_nonzero(key))
-    )
+    units = [np.array(values) for values in (record.X, record.Y, record.Z)]  # the record's are 30 bytes apart
+    n_key_points = int(np.count_nonzero(key))
+    return PointChunk(units[0], units[1], units[2], (a, b, c), (x, y, z), classes, withheld, n_key_points)
 
 
 def coordinates_of(chunk: PointChunk) -> NDArray[np.float64]:
     """Give the coordinates, float64 (n, 3)."""
     return np.asarray(find_coordinates(chunk.x, chunk.y, chunk.z, chunk.scale, chunk.offset))
+
+
+def plan_of(chunk: PointChunk) -> NDArray[np.float64]:
+    """Give the coordinates in plan, float64 (2, n)."""
+    axes = zip((chunk.x, chunk.y), chunk.scale, chunk.offset, strict=False)
+    return np.array([units * scale + offset for units, scale, offset in axes])
 
 
 def place_chunk(chunk: PointChunk, frame: Frame, middle: tuple[float, float]) -> PointChunk:

@@ -17,10 +17,10 @@ from pipeline.plane_mesh.surface_points import NOWHERE, measure_surface
 from pipeline.quality.histograms import Histogram, merge_histograms, quality_histograms
 from pipeline.quality.quality import measure_cells
 from pipeline.quality.residuals import ResidualSums, merge_residuals, sum_residuals
-from tiler.engine.stage import Box, Scope
+from tiler.engine.stage import Box, Scope, whole_file
 from tiler.engine.task import Task
 from tiler.pointclouds.ingest import CELL
-from tiler.stages.readers import read_cloud
+from tiler.stages.readers import hull, read_cloud
 from tiler.store.out_folder import STORE
 from tiler.store.results import COLUMN_ARRAYS, unpack_columns
 from tiler.store.store import Store
@@ -120,16 +120,17 @@ def _measure_near(mesh: ColumnMesh, edges: NDArray[np.int32]) -> dict[str, Histo
 
 
 def _find_files(store: Store) -> Mapping[str, Box]:
-    """Boxes of the cells that each file has points in."""
-    boxes = {}
+    """Boxes of the cells that each file has points in; those of a share are the file's."""
+    boxes: dict[str, Box] = {}
     for name in store.names("points"):
         if store.attributes("points", name)["facts"]["unreadable"]:
             continue
         cell = store.read("points", name, names=("cell",))[0]["cell"]
         if len(cell):
             low, high = cell.min(axis=0) * CELL, (cell.max(axis=0) + 1) * CELL
-            boxes[name] = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    return boxes
+            box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+            boxes[whole_file(name)] = hull(box, boxes.get(whole_file(name)))
+    return {name: boxes[whole_file(name)] for name in store.names("points") if whole_file(name) in boxes}
 
 
 def _measure_points(

@@ -172,7 +172,7 @@ def read_point_file(task: Task) -> Facts:
     blocks = [0]
     steps = [np.empty(0)]
     try:
-        for block in read_cells(task.file, task.context.bounds, frame=task.frame):
+        for block in read_cells(task.file, task.context.bounds, frame=task.frame, share=task.share):
             task.append(
                 units=block.units,
                 classification=become[block.classification],

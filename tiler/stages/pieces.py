@@ -51,7 +51,7 @@ from tiler.mesh_files.mesh_parts import find_tile_parts, join_tiles, read_tile_p
 from tiler.mesh_files.vtk_files import Rows, Values, write_vtp_blocks, write_vtu_blocks
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.left_out import read_polygons
-from tiler.stages.readers import read_bands, read_buildings, read_terrain
+from tiler.stages.readers import facts_of_clouds, read_bands, read_buildings, read_terrain
 from tiler.store.checksums import FILES, state_files
 from tiler.store.results import COLUMN_ARRAYS, unpack_columns
 from tiler.store.run_folder import LEAVES, PATCH_OF_GROUND, REGION, ROOF_MOVED
@@ -263,7 +263,7 @@ def measure_fit(task: Task) -> Facts:
         task.put(**{kind: residual.absolute.counts, f"{kind}_range": _range(residual.absolute)})
     in_mesh, bare = sums.roof.n, sums.missed.n
     # Where a file marks no buildings, what lies beside all footprints may be anything.
-    marked = all(task.store.attributes("points", name)["facts"]["marks_buildings"] for name in task.refs["points"])
+    marked = all(facts["marks_buildings"] for facts in facts_of_clouds(task).values())
     stray = max(n_building - in_mesh - bare, 0) if marked else 0
     return {"fit": facts, "building_points": {"in_mesh": in_mesh, "bare": bare, "stray": stray}}
 

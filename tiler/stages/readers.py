@@ -1,6 +1,7 @@
 """What stages read of each other's results: points, terrain, houses and buildings in a box."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -27,7 +28,7 @@ from pipeline.points_terrain.terrain import cut_terrain, join_terrain
 from stitch.tiling.grid import Bounds
 from tiler.citymodels.tables import NEAR_ARRAYS, NearBuildings, join_near, take_near, unpack_polygons
 from tiler.engine.run_context import find_owned
-from tiler.engine.stage import Box, Facts
+from tiler.engine.stage import Box, Facts, whole_file
 from tiler.engine.task import Task
 from tiler.footprints.footprint_index import FootprintBlock, FootprintRows, join_footprints
 from tiler.pointclouds.cells import ranges_near, select_cells
@@ -164,8 +165,8 @@ def read_units(task: Task, box: Box) -> Iterator[UnitPoints]:
 
 def read_units_of(task: Task, name: str, box: Box) -> Iterator[UnitPoints]:
     """Read the points of a box's cells of one file of the stage ``points``, as `read_units`."""
-    found = _find_rows(task, name, box)
-    for files in _cut_bands([] if found is None else [found]):
+    facts = task.store.attributes("points", name)["facts"]
+    for files in _cut_bands([] if facts["unreadable"] else [_find_rows(task, name, facts, box)]):
         for file in files:
             yield _read_units(task, file)
 
@@ -356,7 +357,48 @@ class _FileRows:
 
 def _find_files(task: Task, box: Box) -> list[_FileRows]:
     """Find the rows to read of all files."""
-    return [file for name in task.refs["points"] if (file := _find_rows(task, name, box)) is not None]
+    shares = _read_facts(task)
+    files = join_shares(shares)
+    return [
+        replace(_find_rows(task, name, facts, box), marks_buildings=files[whole_file(name)]["marks_buildings"])
+        for name, facts in shares.items()
+        if not files[whole_file(name)]["unreadable"]
+    ]
+
+
+def facts_of_clouds(task: Task) -> dict[str, Facts]:
+    """Give the facts of the files of the stage ``points`` that a task reads, as `join_shares`."""
+    return join_shares(_read_facts(task))
+
+
+def _read_facts(task: Task) -> dict[str, Facts]:
+    return {name: task.store.attributes("points", name)["facts"] for name in task.refs["points"]}
+
+
+def join_shares(facts: Mapping[str, Facts]) -> dict[str, Facts]:
+    """Join the facts of shares of a file, by the name of the file.
+
+    It marks buildings where one share does, and cannot be read where one cannot: it has no points then.
+
+    Examples
+    --------
+    >>> one = {"counts": {"read": 2}, "marks_buildings": False, "unreadable": None}
+    >>> join_shares({"a.0": one, "a.1": one | {"marks_buildings": True}})
+    {'a': {'counts': {'read': 4}, 'marks_buildings': True, 'unreadable': None}}
+    """
+    files: dict[str, Facts] = {}
+    for name, share in facts.items():
+        whole = files.setdefault(whole_file(name), share)
+        if whole is not share:
+            unreadable = whole["unreadable"] or share["unreadable"]
+            counts = Counter[str](whole["counts"])
+            counts.update(share["counts"])
+            files[whole_file(name)] = {
+                "counts": {} if unreadable else dict(counts),
+                "marks_buildings": whole["marks_buildings"] or share["marks_buildings"],
+                "unreadable": unreadable,
+            }
+    return files
 
 
 def _cut_bands(files: Sequence[_FileRows]) -> Iterator[list[_FileRows]]:
@@ -381,11 +423,8 @@ def _cut_bands(files: Sequence[_FileRows]) -> Iterator[list[_FileRows]]:
     yield band
 
 
-def _find_rows(task: Task, name: str, box: Box) -> _FileRows | None:
-    """Find the rows of a file in cells that meet a box; None for a file that could not be read."""
-    facts = task.store.attributes("points", name)["facts"]
-    if facts["unreadable"]:
-        return None
+def _find_rows(task: Task, name: str, facts: Facts, box: Box) -> _FileRows:
+    """Find the rows of a file in cells that meet a box."""
     arrays, _ = task.store.read("points", name, names=("cell", "cell_row", "block", "end"))
     ranges = _ranges_of_blocks(arrays["cell"], np.append(arrays["cell_row"], arrays["end"]), arrays["block"], box)
     return _FileRows(name, ranges, tuple(facts["scale"]), tuple(facts["offset"]), facts["marks_buildings"])

@@ -70,7 +70,8 @@ def leave_holes(plan: Plan, missing: Missing, engine: Engine) -> tuple[Plan, Mis
         If no tile is left: the first failure.
     """
     failed = engine.failed()
-    files = frozenset(one.name for one in failed if one.scope is Scope.FILE)
+    lost = {one.file for one in failed if one.scope is Scope.FILE}
+    files = frozenset(name for name, item in plan.layout.files.items() if item.path in lost)
     tiles = {one.name: one for one in failed if one.scope is Scope.TILE}
     for one in failed:
         if one.scope is Scope.FILE:

@@ -16,7 +16,7 @@ from tiler.config.zone_levels import describe_zones
 from tiler.engine.engine import Engine
 from tiler.engine.records import Records
 from tiler.engine.run_context import absent_tiles, tile_name
-from tiler.engine.stage import REGION_ITEM, Facts
+from tiler.engine.stage import REGION_ITEM, Facts, whole_file
 from tiler.engine.task import read_notes
 from tiler.landcover.cover_table import describe_patches, read_table
 from tiler.mesh_files.mesh_parts import MESH_IN_PARTS, describe_parts, note_parts
@@ -30,6 +30,7 @@ from tiler.stages.approach import RIM
 from tiler.stages.city_files import describe_feet
 from tiler.stages.domain import LOW_DOMAIN
 from tiler.stages.inputs import MODEL_OUTLINES
+from tiler.stages.readers import join_shares
 from tiler.store.run_folder import PATCH_OF_GROUND
 from tiler.workflow.empty_run import explain_empty, is_empty
 from tiler.workflow.failed_tiles import Missing, describe_missing
@@ -67,7 +68,8 @@ def summarise_run(
         What was wrong with artefacts that were made anew, by path.
     """
     records = engine.records
-    clouds = {record.name: record.facts for record in records.of("points")}
+    clouds = join_shares({record.name: record.facts for record in records.of("points")})
+    paths = {whole_file(name): item.path for name, item in plan.layout.files.items()}
     notes = [
         *plan.georeference.notes,
         *_collect_notes(engine),
@@ -75,9 +77,7 @@ def summarise_run(
     ]
     notes += [Note(DAMAGED, path, detail=f"{what}; made anew") for path, what in sorted(damage.items())]
     unreadable = dict(plan.unreadable)
-    unreadable |= {
-        plan.layout.files[name].path: facts["unreadable"] for name, facts in clouds.items() if facts["unreadable"]
-    }
+    unreadable |= {paths[name]: facts["unreadable"] for name, facts in clouds.items() if facts["unreadable"]}
     alignment, misaligned, words = describe_alignment(records, config)
     notes += misaligned
     if alignment.get("applied"):
@@ -90,7 +90,7 @@ def summarise_run(
     outline = _join_outlines([record.facts["outline"] for record in records.of("model")])
     left_out = describe_left_out(engine, notes)
     incomplete = unreadable or missing.tiles or missing.others or INCOMPLETE & {note.kind for note in notes}
-    counts = _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)}
+    counts = _join_counts(engine, plan, rounds, clouds) | {"tiles missing": len(missing.tiles)}
     notes += _note_far_terrain(counts, config)
     empty = {"empty": explain_empty(config, plan.region, counts, notes)} if is_empty(config, counts) else {}
     absent = {tile_name(key) for key in absent_tiles(plan.grid)} - missing.tiles.keys()
@@ -224,9 +224,11 @@ def _notes_of_clouds(engine: Engine, config: Config, clouds: Sequence[Facts]) ->
     return notes
 
 
-def _join_counts(engine: Engine, plan: Plan, rounds: int) -> dict[str, int]:
+def _join_counts(engine: Engine, plan: Plan, rounds: int, clouds: Mapping[str, Facts]) -> dict[str, int]:
     """Add up the numbers of all stages."""
     total: Counter[str] = Counter()
+    for facts in clouds.values():
+        add_counts(total, {f"points {name}": n for name, n in facts["counts"].items()})
     total["files"] = len(plan.headers)
     total["files empty"] = sum(header.n_points == 0 for header in plan.headers)
     total["tiles"] = len(plan.layout.tiles)
@@ -237,11 +239,9 @@ def _join_counts(engine: Engine, plan: Plan, rounds: int) -> dict[str, int]:
     for stage in engine.records.stages():
         for record in engine.records.of(stage):
             counts = record.facts.get("counts", {})
-            if stage == "points":
-                counts = {f"points {name}": n for name, n in counts.items()}
             if stage == "pieces":
                 total["facets"] += counts["facets"]
-            else:
+            elif stage != "points":
                 add_counts(total, counts)
     total["points"] = engine.records["report", REGION_ITEM].facts["points"]
     return dict(total)

@@ -157,6 +157,23 @@ def test_blocks_add_up_to_the_file(cloud_file: Path, monkeypatch: pytest.MonkeyP
     np.testing.assert_array_equal(sorted_rows(whole(blocks)), sorted_rows(kept))
 
 
+@pytest.mark.parametrize("name", ["many.laz", "many.las", "plain.laz"])
+def test_shares_add_up_to_the_file(
+    name: str, copc_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(las_chunks, "SOME_POINTS", 7000)
+    path, region = copc_file, (*(ORIGIN[:2] - SIDE), *(ORIGIN[:2] + SIDE))
+    if name != copc_file.name:  # three chunks, the last one not full
+        xyz = ORIGIN + np.random.default_rng(2).uniform(0, 400, (120_000, 3)).round(2)
+        path = write_cloud(tmp_path / name, xyz, np.arange(len(xyz)) % 9)
+    for box in (region, (*(ORIGIN[:2] - 100), *(ORIGIN[:2] + 30))):  # that of less than half is read by the octree
+        parts = [list(read_cells(path, box, share=(k, 4))) for k in range(4)]
+        everything, shares = list(read_cells(path, box)), [block for part in parts for block in part]
+        assert len([part for part in parts if sum(block.counts["kept"] for block in part)]) > 1
+        assert total(shares) == total(everything)
+        np.testing.assert_array_equal(sorted_rows(whole(shares)), sorted_rows(whole(everything)))
+
+
 def test_classes_are_told_before_the_cut(tmp_path: Path) -> None:
     xyz = ORIGIN + np.array([(0, 0, 0), (500, 500, 0), (9, 9, 0)])
     path = write_cloud(tmp_path / "a.laz", xyz, [2, 6, 7])
