@@ -243,11 +243,12 @@ def _all_chunks(path: Path, header: laspy.LasHeader) -> Iterator[BoxedChunk]:
 
 
 def _node_chunks(path: Path, header: laspy.LasHeader, nodes: Nodes) -> Iterator[BoxedChunk]:
-    """Yield as many nodes as have some million points, or one; with the box of each point's node, if known.
+    """Yield as many nodes as have half a million points, or one; with the box of each point's node, if known.
 
+    The bytes of the file are in memory, too.
     `laspy.LasReader.seek` would give other points: it takes each chunk for one of fixed size.
     """
-    batch = (np.cumsum(nodes.count) - nodes.count) // _step(header)
+    batch = (np.cumsum(nodes.count) - nodes.count) // max(1, _step(header) // 2)
     with path.open("rb") as file:
         for part in np.split(np.arange(len(batch)), np.flatnonzero(np.diff(batch)) + 1):
             box = None if nodes.box is None else np.repeat(nodes.box[part], nodes.count[part], axis=0)
