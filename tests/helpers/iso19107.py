@@ -1,7 +1,8 @@
 """An independent check of solids against ISO 19107, with the error codes and tolerances of val3dity.
 
 Faces are judged by shapely in the plane of least squares, shells by VTK, self-intersections by exact determinants
-of whole millimetres. Nothing of the program is used.
+of whole millimetres; what shells and solids have in common by winding numbers on a lattice of places. Nothing of
+the program is used.
 """
 
 from collections import defaultdict
@@ -13,12 +14,15 @@ import numpy as np
 import pyvista
 import shapely
 from numpy.typing import NDArray
+from scipy import ndimage
 
 SNAP = 0.001  # m; vertices closer than this are one
 PLANARITY = 0.01  # m, of the corners of a face from its plane
 MOST_BEND = 20.0  # degrees between two triangles of a face
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Shell = list[list[list[int]]]  # rings of each face, by numbers of vertices
+Shells = list[Shell]
 
 
 def check_solids(
@@ -44,12 +48,97 @@ def check_solids(
             f"scale {scale}; expected {SNAP}, or a tenth: the determinants are those of whole numbers"
         )
     vertices = np.array(document["vertices"], np.int64).reshape(-1, 3)
-    return {
-        (name, item["lod"]): set(check_shell(item["boundaries"][0], vertices, scale[0]))
-        for name, thing in document["CityObjects"].items()
-        for item in thing.get("geometry", [])
-        if item["type"] == "Solid" and item["lod"] in lods
-    }
+    found: dict[tuple[str, str], set[str]] = {}
+    parts: dict[tuple[str, str], list[Shells]] = defaultdict(list)
+    for name, thing in document["CityObjects"].items():
+        for item in thing.get("geometry", []):
+            if item["lod"] not in lods or item["type"] not in ("Solid", "CompositeSolid"):
+                continue
+            solids = [item["boundaries"]] if item["type"] == "Solid" else item["boundaries"]
+            found[name, item["lod"]] = {
+                *(fault for solid in solids for fault in _check_solid(solid, vertices, scale[0])),
+                *_check_composite(solids, vertices),
+            }
+            for parent in thing.get("parents", []):
+                parts[parent, item["lod"]] += solids
+    for key, solids in parts.items():
+        if any((one & other).any() for one, other in _pairs_on_lattices(solids, vertices)):
+            found.setdefault(key, set()).add("601 parts overlap")
+    return found
+
+
+def _check_solid(shells: Shells, vertices: Ints, unit: float) -> Iterator[str]:
+    """Check the outer shell of a solid, its cavities, which look inwards, and how they lie to each other."""
+    yield from check_shell(shells[0], vertices, unit)
+    for cavity in shells[1:]:
+        yield from check_shell(_turn(cavity), vertices, unit)
+    if len(shells) == 1:
+        return
+    lattice = _lattice(shells, vertices)
+    whole, *holes = (_is_within([shell], vertices, lattice) for shell in (shells[0], *map(_turn, shells[1:])))
+    for hole in holes:
+        if (hole & ~whole).any():
+            yield "401 shells cross" if (hole & whole).any() else "403 a cavity lies outside"
+    for one, other in combinations((whole, *holes), 2):
+        if (one == other).all():
+            yield "402 shells are one"
+    if any((one & other).any() and (one != other).any() for one, other in combinations(holes, 2)):
+        yield "401 shells cross"
+    if ndimage.label(whole & ~np.any(holes, axis=0))[1] > 1:
+        yield "404 the inside is in pieces"
+
+
+def _check_composite(solids: list[Shells], vertices: Ints) -> Iterator[str]:
+    """Check how the solids of a composite lie to each other: they may share faces alone, and hang together."""
+    for one, other in _pairs_on_lattices(solids, vertices):
+        if (one & other).any():
+            yield "502 solids are one" if (one == other).all() else "501 solids overlap"
+    if len(solids) > 1:
+        lattice = _lattice([shell for solid in solids for shell in solid], vertices)
+        if ndimage.label(np.any([_is_within(solid, vertices, lattice) for solid in solids], axis=0))[1] > 1:
+            yield "503 solids do not hang together"
+
+
+def _pairs_on_lattices(
+    solids: list[Shells], vertices: Ints
+) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """What of a lattice lies within each of two solids, for all pairs whose boxes overlap."""
+    boxes = [_box(solid, vertices) for solid in solids]
+    for (one, (low, high)), (other, (low_2, high_2)) in combinations(zip(solids, boxes, strict=True), 2):
+        if (np.minimum(high, high_2) - np.maximum(low, low_2) > 2).all():
+            lattice = _lattice([*one, *other], vertices)
+            yield _is_within(one, vertices, lattice), _is_within(other, vertices, lattice)
+
+
+def _turn(shell: Shell) -> Shell:
+    return [[ring[::-1] for ring in face] for face in shell]
+
+
+def _box(shells: Shells, vertices: Ints) -> tuple[Ints, Ints]:
+    used = vertices[np.unique([vertex for shell in shells for face in shell for ring in face for vertex in ring])]
+    return used.min(axis=0), used.max(axis=0)
+
+
+def _lattice(shells: Shells, vertices: Ints) -> Floats:
+    """Places in the box of shells, of one distance in all directions, float64 (i, j, k, 3)."""
+    low, high = _box(shells, vertices)
+    step = max(float((high - low).min()) / 15, float((high - low).max()) / 90)
+    axes = [np.arange(a + 0.37 * step, b, step) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def _is_within(shells: Shells, vertices: Ints, lattice: Floats) -> NDArray[np.bool_]:
+    """Whether places lie within shells, by solid angles of triangles (van Oosterom and Strackee 1983)."""
+    angle = np.zeros(lattice.shape[:-1])
+    for ring in (ring for shell in shells for face in shell for ring in face):
+        for second, third in pairwise(ring[1:]):  # fans: what they have too much cancels in a plane
+            a, b, c = (vertices[vertex] - lattice for vertex in (ring[0], second, third))
+            x, y, z = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
+            across = np.einsum("...i,...i", a, np.cross(b, c))
+            ab, bc, ca = (np.einsum("...i,...i", p, q) for p, q in ((a, b), (b, c), (c, a)))
+            angle += 2 * np.arctan2(across, x * y * z + ab * z + bc * x + ca * y)
+    within: NDArray[np.bool_] = angle > 2 * np.pi
+    return within
 
 
 def check_shell(faces: list[list[list[int]]], vertices: Ints, unit: float = SNAP) -> Iterator[str]:

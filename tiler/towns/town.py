@@ -248,11 +248,11 @@ def _list_files(directory: Path, clouds: list[Path], houses: int) -> TownFiles:
 
 
 def write_faults(path: Path) -> None:
-    """Write broken solids, a building a fault, as CityJSONSeq."""
+    """Write broken solids, a building each, as CityJSONSeq."""
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(model_head(pyproj.CRS(CRS)))
-        for number, (name, faces) in enumerate(list_faults()):
-            file.write(fault_feature(name, faces, (ORIGIN[0] + 60.0 * number, ORIGIN[1], 10.0)))
+        for number, fault in enumerate(list_faults()):
+            file.write(fault_feature(fault, (ORIGIN[0] + 60.0 * number, ORIGIN[1], 10.0)))
 
 
 def list_tiles(bounds: Box) -> Iterator[tuple[Box, tuple[int, int]]]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
+from pipeline.architecture.faults import Fault
 from pipeline.architecture.interiors import make_interior
 from pipeline.architecture.levels import Footprint, Volume, make_level
 from pipeline.architecture.lots import Lot
@@ -72,8 +73,8 @@ def variant_feature(house: House, asked: Representation) -> str:
     return _feature_line(house.id, objects, vertices)
 
 
-def fault_feature(name: str, faces: Sequence[Sequence[Sequence[Point]]], corner: Point) -> str:
-    """Give the line of a solid whose shell is as it is, moved to a corner (m)."""
+def fault_feature(fault: Fault, corner: Point) -> str:
+    """Give the line of a building whose solids are as they are, moved to a corner (m)."""
     vertices = _Vertices()
 
     def place(ring: Sequence[Point]) -> list[int]:
@@ -81,13 +82,18 @@ def fault_feature(name: str, faces: Sequence[Sequence[Sequence[Point]]], corner:
             [(round(x + corner[0], 3), round(y + corner[1], 3), z + corner[2]) for x, y, z in ring]
         )
 
-    shell = [[place(ring) for ring in face] for face in faces]
-    thing = {
-        "type": "Building",
-        "attributes": {"fault": name},
-        "geometry": [{"type": "Solid", "lod": "1.2", "boundaries": [shell]}],
-    }
-    return _feature_line(name, {name: thing}, vertices)
+    name, kind, _ = fault
+    solids = [[[[place(ring) for ring in face] for face in shell] for shell in solid] for solid in fault.solids]
+    objects: dict[str, Any] = {name: {"type": "Building", "attributes": {"fault": name}}}
+    if kind == "BuildingPart":
+        objects[name]["children"] = [f"{name}-part-{k + 1}" for k in range(len(solids))]
+        for part, solid in zip(objects[name]["children"], solids, strict=True):
+            geometry = [{"type": "Solid", "lod": "1.2", "boundaries": solid}]
+            objects[part] = {"type": kind, "parents": [name], "geometry": geometry}
+    else:
+        boundaries: Any = solids[0] if kind == "Solid" else solids
+        objects[name]["geometry"] = [{"type": kind, "lod": "1.2", "boundaries": boundaries}]
+    return _feature_line(name, objects, vertices)
 
 
 def lot_feature(lot: Lot, ground: Callable[[float, float], float]) -> str:

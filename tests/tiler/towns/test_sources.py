@@ -76,8 +76,7 @@ def test_attributes_win_over_rules(tmp_path: Path, capsys: pytest.CaptureFixture
     found = check_solids(read_document(tmp_path / "w/town.city.jsonl"), ("1.2", "2.2"))
     assert found["c", "2.2"] == found["c", "1.2"] == set()
     broken = check_solids(read_document(tmp_path / "t/broken.city.jsonl"), ("1.2",))
-    assert len(broken) == 19
-    assert all(broken.values())
+    assert sum(map(bool, broken.values())) == 27
     # Parameters make the same model, and edited ones another.
     again = ["--parameters", str(tmp_path / "t/parameters.jsonl")]
     assert main(["synth", str(tmp_path / "u"), *style, *again]) == 0

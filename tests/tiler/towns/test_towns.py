@@ -57,7 +57,7 @@ def read_document(path: Path) -> dict[str, Any]:
         first = len(head["vertices"])
         head["vertices"] += feature["vertices"]
         for name, thing in feature["CityObjects"].items():
-            for one in thing["geometry"]:
+            for one in thing.get("geometry", []):
                 one["boundaries"] = _shift(one["boundaries"], first)
             head["CityObjects"][name] = thing
     return head
