@@ -159,7 +159,8 @@ def write_run(
     (directory / "run.json").write_text(json.dumps(record))
     (x0, y0, x1, y1), z = city.bounds, city.mesh.points[:, 2]
     box = (x0, y0, z.min(), x1, y1, z.max())
-    write_city_model(directory / "citymodel.city.json", city.model, crs="EPSG:28992", bounds=box)
+    for file in ("citymodel.city.json", "citymodel-full.city.json"):
+        write_city_model(directory / file, city.model, crs="EPSG:28992", bounds=box)
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], None]) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, TemporaryFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,14 @@ from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proo
 from tiler.check.check_piece import ANY, GROUND, TOP
 from tiler.check.piece_survey import LoadDtm, PieceTask, Survey, load_survey, survey_piece
 from tiler.check.proofs import Fault, Finding, Proof, Vertices
-from tiler.check.solid_proofs import check_solids
+from tiler.check.solid_proofs import check_crs, check_solids
 from tiler.check.zone_proofs import check_zones
-from tiler.citymodels.building_index import BuildingIndex, index_buildings, open_vertices
+from tiler.citymodels.building_index import BuildingIndex, copy_vertices, index_buildings, open_vertices
 from tiler.executors.in_order import check_workers, map_in_order
 from tiler.mesh_files.mesh_parts import report_parts
 from tiler.mesh_files.vtk_files import read_piece_paths
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD
-from tiler.store.run_folder import PARTS, RunRecord, read_run_record
+from tiler.store.run_folder import PARTS, RunRecord, read_crs, read_run_record
 
 VOLUME_INDEX = "mesh.pvtu"
 BOUNDARY_INDEX = "boundary.pvtp"
@@ -123,10 +123,10 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
             PieceTask(directory, *names, Path(folder), Path(folder) / f"{k}.survey", load_dtm)
             for k, names in enumerate(files)
         ]
-        items: list[tuple[Path, Path] | PieceTask] = [(directory / CITY_MODEL, Path(folder)), *tasks]
+        items: list[tuple[Path, Path] | PieceTask] = [(directory, Path(folder)), *tasks]
         sums, frontier = _Sums.start(len(index)), start_frontier()
         looks = map_in_order(_look, items, workers)
-        (solids,) = next(looks)
+        models = next(looks)
         for number, (task, _) in enumerate(zip(tasks, looks, strict=True)):
             survey = load_survey(task.out)
             rim = replace(survey.rim, part=survey.rim.part + len(sums.part_cells))
@@ -137,22 +137,29 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
         sums.add_settled(close_frontier(frontier))
         sums.add_rim_walls()
         claims, facts = _conclude(sums, len(files), record, index)
-        claims += (solids,)
+        claims += models
         if record.zones:
-            models = directory / CITY_MODEL, directory / FULL_CITY_MODEL
-            claims += (check_zones(record.zones, *models, record.level_counts),)
+            files_of_models = directory / CITY_MODEL, directory / FULL_CITY_MODEL
+            claims += (check_zones(record.zones, *files_of_models, record.level_counts),)
         parts = sums.count_parts()
         remarks = (report_parts(parts),) if len(parts) > 1 else ()
         return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)
 
 
 def _look(item: tuple[Path, Path] | PieceTask) -> tuple[Proof, ...]:
-    """Look at the solids of a city model, which gives a proof, or at a piece."""
+    """Look at the city models of a folder, which gives proofs, or at a piece."""
     if isinstance(item, PieceTask):
         survey_piece(item)
         return ()
-    path, folder = item
-    return (check_solids(path, open_vertices(folder)),)
+    directory, folder = item
+    model, full = open_vertices(folder), directory / FULL_CITY_MODEL
+    with TemporaryFile() as file:
+        earlier = copy_vertices(full, file)
+        return (
+            check_solids(directory / CITY_MODEL, model),
+            check_solids(full, earlier, title="the city model before simplification"),
+            check_crs({CITY_MODEL: model, FULL_CITY_MODEL: earlier}, read_crs(directory / RUN_RECORD)),
+        )
 
 
 @dataclass(eq=False)

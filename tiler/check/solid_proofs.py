@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import shapely
 from numpy.typing import NDArray
 
@@ -26,6 +27,7 @@ from tiler.citymodels.building_index import (
 )
 from tiler.citymodels.building_index import Vertices as ModelVertices
 from tiler.citymodels.cityjson import BLOCK_HEIGHTS
+from tiler.citymodels.cityjson_text import reference_system
 
 TOGETHER = 1024  # buildings that are looked at together
 HEIGHT_STEP = 1e-3  # m: CityJSON rounds coordinates to 1 mm, the heights among the attributes are not rounded
@@ -49,7 +51,21 @@ DETAILS = {
 }
 
 
-def check_solids(path: Path, vertices: ModelVertices) -> Proof:
+def check_crs(found: Mapping[str, ModelVertices], crs: str) -> Proof:
+    """Hold the CRS that city models name, by file, against that of the run; without EPSG code it has none."""
+    wanted = reference_system(pyproj.CRS(crs))
+    stated = {
+        file: (vertices.head.get("metadata") or {}).get("referenceSystem") for file, vertices in found.items()
+    }
+    faults = tuple(
+        Fault("model-crs", 1, (), f"{file} names {name}, expected {wanted}")
+        for file, name in stated.items()
+        if name != wanted
+    )
+    return Proof(f"the {len(stated)} city models name the CRS of run.json, {crs}", faults)
+
+
+def check_solids(path: Path, vertices: ModelVertices, *, title: str = "the city model") -> Proof:
     """Read the objects of a city model, some at a time, and tell how many solids are right.
 
     Parameters
@@ -58,6 +74,8 @@ def check_solids(path: Path, vertices: ModelVertices) -> Proof:
         The city model.
     vertices : Vertices
         Its vertices.
+    title : str
+        What the claim calls it.
 
     Raises
     ------
@@ -84,7 +102,7 @@ def check_solids(path: Path, vertices: ModelVertices) -> Proof:
             proofs.add(batch, vertices)
             batch = _Batch()
     proofs.add(batch, vertices)
-    return proofs.prove()
+    return proofs.prove(title)
 
 
 class _Found:
@@ -111,7 +129,7 @@ class _Found:
                 place = batch.buildings[k].footprint.representative_point()
                 places.append((place.x, place.y, batch.buildings[k].roof))
 
-    def prove(self) -> Proof:
+    def prove(self, title: str) -> Proof:
         faults = [
             Fault(kind, n, tuple(self._places[kind]), DETAILS[kind])
             for kind, n in sorted(self._count.items())
@@ -120,7 +138,7 @@ class _Found:
         if self._kin[0] != self._kin[1]:
             faults.append(Fault("parts", 1, (), "children of houses and parents of parts differ"))
         flat = f", {self._n_flat} flat buildings have none" if self._n_flat else ""
-        claim = f"{self._n_solids} solids of the city model are closed and stand from ground to roof{flat}"
+        claim = f"{self._n_solids} solids of {title} are closed and stand from ground to roof{flat}"
         bound = f"bound: {HEIGHT_STEP:g} m"
         if self._n_sloped:
             bound += f", {ROOF_TOLERANCE:g} m of the {self._n_sloped} with sloped roofs"

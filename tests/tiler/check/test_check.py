@@ -41,7 +41,7 @@ from tiler.check.proofs import Dtm, Fault, merge_faults
 from tiler.mesh_files.vtk_xml import write_data_file
 
 Tamper = Callable[[TinyCity], TinyCity]
-N_PROOFS = 16
+N_PROOFS = 18
 
 
 @pytest.fixture(scope="module")
@@ -505,6 +505,22 @@ def edit_run(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]
 
 def edit_model(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
     return lambda folder: edit_json(folder / "citymodel.city.json", change)
+
+
+def test_both_city_models_are_proved(tmp_path: Path, city: TinyCity) -> None:
+    write_run(tmp_path, city)
+    files = [tmp_path / name for name in ("citymodel.city.json", "citymodel-full.city.json")]
+    texts = [file.read_text() for file in files]
+    for file, text in zip(files, texts, strict=True):
+        edit_json(
+            file,
+            lambda model: model["metadata"].update(referenceSystem=model["metadata"]["referenceSystem"] + "1"),
+        )
+        assert kinds(check(tmp_path)) == {"model-crs"}
+        file.write_text(text)
+    edit_json(files[1], lambda model: model["CityObjects"]["corner-a"]["attributes"].update(ground_height=-1.0))
+    (found,) = (proof for proof in check(tmp_path).proofs if "before simplification" in proof.claim)
+    assert {fault.kind for fault in found.faults} >= {"solid-height"}
 
 
 def add_building(model: dict[str, Any]) -> None:
