@@ -18,6 +18,7 @@ from scipy import ndimage
 
 SNAP = 0.001  # m; vertices closer than this are one
 PLANARITY = 0.01  # m, of the corners of a face from its plane
+ROUNDED = 1.0  # units of coordinates; rounded walls cross by less
 MOST_BEND = 20.0  # degrees between two triangles of a face
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -102,12 +103,26 @@ def _check_composite(solids: list[Shells], vertices: Ints) -> Iterator[str]:
 def _pairs_on_lattices(
     solids: list[Shells], vertices: Ints
 ) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """What of a lattice lies within each of two solids, for all pairs whose boxes overlap."""
+    """What of a lattice lies within each of two solids, for all pairs that overlap in plan."""
     boxes = [_box(solid, vertices) for solid in solids]
-    for (one, (low, high)), (other, (low_2, high_2)) in combinations(zip(solids, boxes, strict=True), 2):
+    plans = [_project(solid, vertices) for solid in solids]
+    for one, other in combinations(range(len(solids)), 2):
+        (low, high), (low_2, high_2) = boxes[one], boxes[other]
         if (np.minimum(high, high_2) - np.maximum(low, low_2) > 2).all():
-            lattice = _lattice([*one, *other], vertices)
-            yield _is_within(one, vertices, lattice), _is_within(other, vertices, lattice)
+            common = shapely.buffer(shapely.intersection(plans[one], plans[other]), -ROUNDED)
+            if not shapely.is_empty(common):
+                lattice = _lattice(solids[one] + solids[other], vertices)
+                yield _is_within(solids[one], vertices, lattice), _is_within(solids[other], vertices, lattice)
+
+
+def _project(shells: Shells, vertices: Ints) -> shapely.Geometry:
+    """The plan of a solid, the union of its faces seen from above."""
+    faces = [
+        shapely.Polygon(vertices[face[0], :2], [vertices[hole, :2] for hole in face[1:]])
+        for face in shells[0]
+        if len(face[0]) > 2
+    ]
+    return shapely.union_all(shapely.buffer(shapely.make_valid(faces), 0))
 
 
 def _turn(shell: Shell) -> Shell:
