@@ -6,7 +6,7 @@ pyogrio and pyarrow are imported where they are used: few tasks need them.
 import json
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +98,8 @@ def open_layer(path: Path, layer: str) -> GdalLayer:
         if info["driver"] == "OSM":
             options["CONFIG_FILE"] = str(OSM_OPTIONS)
             source, info = _read_info(path, name, options)
+        if info["driver"] == "GeoJSON" and info["total_bounds"] is None:  # a Feature or a geometry alone
+            source, info = _read_info(path, name, options | {"force_total_bounds": True})
         driver = str(info["driver"])
         if isinstance(source, bytes):
             driver = "GPKG" if _is_sqlite(path) else ""
@@ -160,7 +162,7 @@ def _list_spatial(path: Path) -> list[str]:
         return ask_gpkg(path, "SELECT table_name FROM gpkg_geometry_columns")
 
 
-def _read_info(path: Path, name: str, options: dict[str, str]) -> tuple[Path | bytes, dict[str, Any]]:
+def _read_info(path: Path, name: str, options: Mapping[str, str | bool]) -> tuple[Path | bytes, dict[str, Any]]:
     import pyogrio
 
     try:

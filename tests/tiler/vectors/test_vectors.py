@@ -156,12 +156,13 @@ def test_no_crs_is_the_regions_and_told(tmp_path: Path) -> None:
     assert told == [("footprints-without-crs", "a.gpkg", "taken as EPSG:28992, the region's CRS")]
 
 
-def test_metres_in_a_geojson_without_crs_are_no_degrees(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["geometry", "feature", "collection"])
+def test_metres_in_a_geojson_without_crs_are_no_degrees(tmp_path: Path, form: str) -> None:
     path = tmp_path / "a.geojson"
     shape = shapely.to_geojson(square(5, 5))
-    path.write_text(
-        f'{{"type":"FeatureCollection","features":[{{"type":"Feature","properties":{{}},"geometry":{shape}}}]}}'
-    )
+    feature = f'{{"type":"Feature","properties":{{}},"geometry":{shape}}}'
+    collection = f'{{"type":"FeatureCollection","features":[{feature}]}}'
+    path.write_text({"geometry": shape, "feature": feature, "collection": collection}[form])
     with pytest.raises(InputError, match=r"EPSG:4326 \(degrees\), but its coordinates reach 486015"):
         read(path)
 
