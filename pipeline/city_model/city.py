@@ -44,6 +44,7 @@ class CityOptions:
     clearance_floor: float
     min_courtyard_area: float
     roofs: Literal["planes", "skeleton", "flat"]
+    roof_price: float
     split_levels: bool
     roof_group: float
     manifold: bool

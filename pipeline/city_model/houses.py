@@ -167,7 +167,8 @@ def _fit_sloped(
     laid = np.zeros(len(model), np.bool_)
     laid[list(new)] = True
     used = points if prefer_points else leave_out_points(points, laid)
-    fitted = fit_roofs(model.polygons, used, RoofOptions(clearance=options.clearance))
+    rules = RoofOptions(clearance=options.clearance, cut_price=options.roof_price)
+    fitted = fit_roofs(model.polygons, used, rules)
     if prefer_points:
         laid &= fitted.too_few
         new = {row: roof for row, roof in new.items() if laid[row]}

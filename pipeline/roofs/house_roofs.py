@@ -68,7 +68,7 @@ class RoofOptions:
     max_slope : float
         Greatest slope of a roof.
     cut_price : float
-        What a new wall must save: area (m²) of roof that is a metre and more off its points.
+        What a new wall must save: area (m²) of roof that is half a metre off its points.
     min_step, min_kink : float
         A wall stays where the roof steps by this (m), or its slopes differ by so much.
     max_depth : int

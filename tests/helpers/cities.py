@@ -31,6 +31,7 @@ CITY_OPTIONS = CityOptions(
     clearance_floor=0.1,
     min_courtyard_area=10.0,
     roofs="flat",
+    roof_price=4.0,
     split_levels=False,
     roof_group=2.0,
     manifold=False,

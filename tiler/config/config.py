@@ -234,6 +234,10 @@ class Config:
         "outline, or flat; always flat with mesher = layered or simplify = paper",
         choices=("planes", "skeleton", "flat"),
     )  # fmt: skip
+    roof_price: float = _parameter(
+        4.0, "simplify", "roof area half a metre off its points that a wall between planes must save: less gives "
+        "more planes and cells, with roofs = planes", unit="m2", least=0.5,
+    )  # fmt: skip
     split_levels: bool = _parameter(
         True, "simplify", "divide houses where their roof points show a step, with roofs = flat"
     )
@@ -571,6 +575,7 @@ def idle_parameters(config: Config) -> list[str]:
         for name, (other, value) in CONDITIONS.items()
     ]
     idle += [
+        (("roof_price",), config.roofs == "planes" and config.has_sloped_roofs, "roofs = planes"),
         (OF_FLAT_ROOFS, not config.has_sloped_roofs, "roofs = flat"),
         (("grading",), config.graded_size, "open_size above 0"),
         (("wall_growth",), config.wall_size, "wall_size above 0"),
