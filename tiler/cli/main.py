@@ -483,6 +483,27 @@ def _detail(options: argparse.Namespace) -> int:
     return _tell(detail_models(options.inputs, options.output, asked), options.output)
 
 
+def _facade_rules(options: argparse.Namespace) -> int:
+    from tiler.detail.image_rules import RulesAsked, write_facade_rules
+
+    asked = _from_options(RulesAsked, options)
+    return _tell(write_facade_rules(options.image, options.output, asked), options.output)
+
+
+def _vegetation(options: argparse.Namespace) -> int:
+    from tiler.textures.vegetation import train_classifier
+
+    lines = train_classifier(options.images, options.masks, options.output, overwrite=options.overwrite)
+    return _tell(lines, options.output)
+
+
+def _texture(options: argparse.Namespace) -> int:
+    from tiler.textures.texture import TextureAsked, texture_models
+
+    asked = _from_options(TextureAsked, options)
+    return _tell(texture_models(options.inputs, options.output, asked), options.output)
+
+
 def _from_options(kind: type[T], options: argparse.Namespace, **given: Any) -> T:
     """Make a dataclass of the options with the names of its fields, but for those that are given."""
     entries: Any = kind
@@ -573,6 +594,9 @@ HANDLERS: Mapping[str, Handler] = {
     "convert": _convert,
     "generalise": _generalise,
     "detail": _detail,
+    "facade-rules": _facade_rules,
+    "texture": _texture,
+    "vegetation": _vegetation,
     "wind": _wind,
     "kernels": _kernels,
     "config": _config,

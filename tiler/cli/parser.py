@@ -178,6 +178,11 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
     _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
     _add_detail(command("detail", "write city models with windows, doors and balconies by rules, at LoD3"))
+    _add_facade_rules(
+        command("facade-rules", "find storeys, bays and windows in an image of a façade, as rules for detail")
+    )
+    _add_texture(command("texture", "put oriented images on walls and roofs of city models, a GLB a tile"))
+    _add_vegetation(command("vegetation", "train a classifier of plants in images, for texture"))
     _add_generalise(
         command("generalise", "make blocks of buildings between streets: cells and LoD0C, LoD0B, LoD0A")
     )
@@ -753,6 +758,60 @@ def _add_detail(detail: argparse.ArgumentParser) -> None:
     add("--lod", choices=LODS, default="auto", help="level of detail that gets façades (default: auto)")
     add("--json", type=Path, default=None, dest="json_file", metavar="FILE", help="also write the table as JSON")
     add("--overwrite", action="store_true", help="replace the files if they exist")
+
+
+def _add_facade_rules(rules: argparse.ArgumentParser) -> None:
+    """Add image, size and output of rules."""
+    add = rules.add_argument
+    add("image", type=_on_disk, metavar="IMAGE", help="rectified image of the façade alone")
+    add("--size", required=True, metavar="WIDTH,HEIGHT", help="width and height of the façade (m)")
+    add("-o", "--output", type=_on_disk, required=True, metavar="FILE", help="JSON file of rules to write")
+    add("--overwrite", action="store_true", help="replace the file if it exists")
+
+
+def _add_vegetation(train: argparse.ArgumentParser) -> None:
+    """Add images, labels and output of a training."""
+    add = train.add_argument
+    add("images", type=_on_disk, metavar="DIR", help="folder of images")
+    add(
+        "--masks", type=_on_disk, required=True, metavar="DIR",
+        help="folder of their labels, NAME.png: not black where there are plants",
+    )  # fmt: skip
+    add("-o", "--output", type=_on_disk, required=True, metavar="FILE", help="JSON file to write")
+    add("--overwrite", action="store_true", help="replace the file if it exists")
+
+
+def _add_texture(texture: argparse.ArgumentParser) -> None:
+    """Add cameras, images, output and options of textures."""
+    _add_workers(texture, "texture tiles")
+    add = texture.add_argument
+    add(
+        "inputs", nargs="+", type=_on_disk, metavar="MODEL|DIR",
+        help="city model files; or the folder of a run, whose ground hides, too",
+    )  # fmt: skip
+    add(
+        "--cameras", type=_on_disk, required=True, metavar="FILE|DIR",
+        help="cameras of COLMAP, Bundler, OpenSfM or OpenDroneMap",
+    )  # fmt: skip
+    add("--images", type=_on_disk, required=True, metavar="DIR", help="folder of the images")
+    add("-o", "--output", type=_on_disk, required=True, metavar="DIR", help="folder to write")
+    add(
+        "--origin", default="", metavar="X,Y,Z",
+        help="place in the CRS of the city that coordinates of the cameras count from (needed unless OpenSfM "
+        "states a reference)",
+    )  # fmt: skip
+    add(
+        "--geoid-height", type=float, default=0.0, metavar="M",
+        help="height of the geoid above the ellipsoid, taken from heights of an OpenSfM reference (default: 0)",
+    )  # fmt: skip
+    add("--vegetation", type=_on_disk, default=None, metavar="FILE", help="classifier of plants, which hide")
+    add("--texel", type=float, default=0.1, metavar="M", help="side of a texel (default: 0.1)")
+    add(
+        "--least-resolution", type=float, default=2.0, metavar="NUMBER",
+        help="pixels per metre that an image must have of a surface (default: 2)",
+    )  # fmt: skip
+    add("--tile-size", type=float, default=250.0, metavar="METRES", help="side of a tile (default: 250)")
+    add("--overwrite", action="store_true", help="replace the folder if it exists")
 
 
 def _on_disk(text: str) -> Path:

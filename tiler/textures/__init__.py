@@ -1,0 +1,1 @@
+"""Textures of oriented images on the walls and roofs of city models: `citystitch texture`."""
