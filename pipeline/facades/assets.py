@@ -32,11 +32,14 @@ class Made:
         Fill these holes: together with the wall they are closed.
     installations : list of list of Surface
         Balconies, each closed.
+    flat : dict of int to (Insert, (float, float))
+        The flat assets, with their lower left corners (m), by the number of their surface.
     """
 
     wall: Surface = field(default_factory=lambda: Surface(WALL, [], []))
     surfaces: list[Surface] = field(default_factory=list)
     installations: list[list[Surface]] = field(default_factory=list)
+    flat: dict[int, tuple[Insert, Flat]] = field(default_factory=dict)
 
     def count(self) -> int:
         """Give the number of polygons, without the wall."""
@@ -57,7 +60,10 @@ def build(made: Made, insert: Insert, corner: Flat, percent: int) -> None:
     percent : int
         Of its polygons; see `count_steps`.
     """
-    for _ in islice(_steps(made, insert, corner), count_steps(insert, percent)):
+    n = count_steps(insert, percent)
+    if n == 1:
+        made.flat[len(made.surfaces)] = (insert, corner)
+    for _ in islice(_steps(made, insert, corner), n):
         pass
 
 

@@ -36,7 +36,8 @@ def join_small(
     Notes
     -----
     A joined cell is a cell: it goes on while it is small. Of equal borders the greater neighbour, then the smaller
-    index is taken. With `among` no result is greater than twice the limit. O(p log p), in memory.
+    index is taken. With `among` no result is greater than twice the limit. O(p log p); memory holds some hundred
+    bytes for each border of a small cell.
 
     Examples
     --------
@@ -45,10 +46,13 @@ def join_small(
     """
     size, root = area.tolist(), np.arange(len(area))
     beside: dict[int, dict[int, float]] = {}
-    for (a, b), border in zip(pairs.tolist(), length.tolist(), strict=True):
-        if among is None or (among[a] and among[b]):
-            beside.setdefault(a, {})[b] = border
-            beside.setdefault(b, {})[a] = border
+    # Cells only grow, so that borders of which none can be looked at may be left out: those of two large cells, or
+    # with `among` of one.
+    small = area < limit if among is None else among & (area <= limit)
+    used = small[pairs].any(axis=1) if among is None else small[pairs].all(axis=1)
+    for (a, b), border in zip(pairs[used].tolist(), length[used].tolist(), strict=True):
+        beside.setdefault(a, {})[b] = border
+        beside.setdefault(b, {})[a] = border
 
     def is_small(cell: int) -> bool:
         return bool(size[cell] < limit if among is None else size[cell] <= limit)

@@ -123,10 +123,12 @@ def sum_pairs(pairs: Index, length: Array) -> tuple[Index, Array]:
     >>> sum_pairs(np.array([[1, 0], [0, 1], [2, 2]]), np.array([1.0, 2.0, 5.0]))
     (array([[0, 1]]), array([3.]))
     """
-    both = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
-    given = length[pairs[:, 0] != pairs[:, 1]]
-    found, number = np.unique(both, axis=0, return_inverse=True)
-    return found, np.bincount(number.ravel(), given, minlength=len(found)).astype(np.float64)
+    two = pairs[:, 0] != pairs[:, 1]
+    most = pairs.max(initial=0) + 1
+    # One number for both, in which they sort as they do themselves.
+    both, number = np.unique(pairs[two].min(axis=1) * most + pairs[two].max(axis=1), return_inverse=True)
+    found: Index = np.column_stack((both // most, both % most))
+    return found, np.bincount(number, length[two], minlength=len(found)).astype(np.float64)
 
 
 def match_sides(one: tuple[Index, Array, Array], other: tuple[Index, Array, Array]) -> tuple[Index, Array]:

@@ -4,7 +4,8 @@ A city is meshed three times: in full detail, in full detail with other tiles, a
 problems are solved on each with linear elements: heat that is made evenly and leaves through ground, walls and
 roofs (Poisson), and potential flow from west to east. By radius around the focus it prints how far the second and
 the third mesh are from the first (relative L2 norms of temperature and velocity below 30 m), so that the
-former is what another mesh of the same detail differs by; and cells, quality in the focus, and its city model.
+former is what another mesh of the same detail differs by; and cells, quality in the focus, and its city model. It
+ends with 1 where the bounds of docs/lod-zones.md are exceeded.
 """
 
 import argparse
@@ -35,6 +36,8 @@ LOW = 30.0  # m above the lowest ground; cells above it do not count
 SOLID, WEST, EAST = (1, 2, 3), 5, 6  # boundary markers
 TOLERANCE = 1e-9
 PERCENTILES = (0.1, 1, 5, 50)
+# Of a focus: share of the cells of full detail, and loss of radius ratios in it.
+MOST_CELLS, MOST_LOSS = 0.15, 0.03
 
 
 @skfem.BilinearForm  # type: ignore[untyped-decorator]
@@ -114,48 +117,44 @@ def focus_model(out: Path, told: dict[str, Any]) -> list[str]:
     return [json.dumps(row, sort_keys=True) for row in kept]
 
 
-def main() -> None:
-    """Mesh, solve, print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--size", type=float, default=640.0, help="side of the city (m)")
-    parser.add_argument("--mesh", type=float, default=5.0, help="size of cells in full detail (m)")
-    parser.add_argument("--radius", type=float, default=80.0, help="of the focus (m)")
-    given = parser.parse_args()
-    n = round(480 * given.size**2 / 1e6)
-    whole = city_files(given.folder / "city", size=given.size, buildings=n, density=2.0, roofs="mixed", seed=3)
-    whole |= {"tile_size": given.size / 2, "overwrite": True}
-    west, south, east, north = 318000.0, 6399000.0, 318000.0 + given.size, 6399000.0 + given.size
-    middle = ((west + east) / 2, (south + north) / 2)
-    focus = f"{middle[0]:g},{middle[1]:g},{given.radius:g},{given.mesh:g}"
-    options = {
-        "full": {"mesh_size": given.mesh},
-        "other tiles": {"mesh_size": given.mesh, "tile_size": given.size / 3},
-        "focus": {"mesh_size": 4 * given.mesh, "focus": focus},
+def measure(folder: Path, size: float, mesh: float, radius: float, *, tiles: int = 2) -> dict[str, Any]:
+    """Mesh, solve, print the tables; gives the share of cells, the largest loss of quality, and differences."""
+    whole = city_files(
+        folder / "city", size=size, buildings=round(480 * size**2 / 1e6), density=2.0, roofs="mixed", seed=3
+    )
+    whole |= {"tile_size": size / tiles, "overwrite": True}
+    middle = (318000.0 + size / 2, 6399000.0 + size / 2)
+    options: dict[str, dict[str, Any]] = {
+        "full": {"mesh_size": mesh},
+        "other tiles": {"mesh_size": mesh, "tile_size": size / (tiles + 1)},
+        "focus": {"mesh_size": 4 * mesh, "focus": f"{middle[0]:g},{middle[1]:g},{radius:g},{mesh:g}"},
     }
     solved, cells = {}, {}
     for name, more in options.items():
-        out = given.folder / name.replace(" ", "-")
+        out = folder / name.replace(" ", "-")
         record = run(make_config(whole | more | {"out": str(out)}))
         cells[name], solved[name] = record["counts"]["cells"], Solved(out)
-    objects = json.loads((given.folder / "focus" / CITY_MODEL).read_text())["CityObjects"]
+    objects = json.loads((folder / "focus" / CITY_MODEL).read_text())["CityObjects"]
     told = {name: row["attributes"] for name, row in objects.items() if "attributes" in row}
-    same = focus_model(given.folder / "full", told) == focus_model(given.folder / "focus", told)
+    same = focus_model(folder / "full", told) == focus_model(folder / "focus", told)
     full = solved["full"]
     distance = np.hypot(*(full.centre[:, :2] - middle).T)
     low = full.centre[:, 2] < full.points[:, 2].min() + LOW
     print(f"buildings of the focus are {'the same' if same else 'NOT the same'} as in full detail\n")
     print("| mesh | cells | " + " | ".join(f"{p:g} %" for p in PERCENTILES) + " |\n|---|---|" + "---|" * 4)
+    ratios = {}
     for name, one in solved.items():
-        inside = np.hypot(*(one.centre[:, :2] - middle).T) < given.radius
-        ratio = np.percentile(measure_cells(TetMesh(one.points, one.cells[inside])).radius_ratio, PERCENTILES)
-        print(f"| {name} | {cells[name]:,} | " + " | ".join(f"{value:.3f}" for value in ratio) + " |")
+        inside = np.hypot(*(one.centre[:, :2] - middle).T) < radius
+        found = measure_cells(TetMesh(one.points, one.cells[inside])).radius_ratio
+        ratios[name] = np.percentile(found, PERCENTILES)
+        print(f"| {name} | {cells[name]:,} | " + " | ".join(f"{value:.3f}" for value in ratios[name]) + " |")
     print(
         "\n| within | Poisson: other tiles | focus | potential flow: other tiles | focus |\n|---|---|---|---|---|"
     )
-    for radius in (given.radius / 4, given.radius / 2, given.radius, 2 * given.radius, 3 * given.radius):
-        rows = np.flatnonzero((distance < radius) & low)
-        places, margin = full.centre[rows], 40 * given.mesh
+    by_radius = {}
+    for reach in (radius / 4, radius / 2, radius, 2 * radius, 3 * radius):
+        rows = np.flatnonzero((distance < reach) & low)
+        places, margin = full.centre[rows], 40 * mesh
         box = places.min(axis=0) - margin, places.max(axis=0) + margin
         heat = full.heat[full.cells[rows]].mean(axis=1)
         shown = []
@@ -168,8 +167,44 @@ def main() -> None:
                     relative(full.speed[rows][there], other_speed[there], weight),
                 )
             )
-        values = [shown[0][0], shown[1][0], shown[0][1], shown[1][1]]
-        print(f"| {radius:g} m | " + " | ".join(f"{value:.2f} %" for value in values) + " |", flush=True)
+        by_radius[reach / radius] = [shown[0][0], shown[1][0], shown[0][1], shown[1][1]]
+        values = " | ".join(f"{value:.2f} %" for value in by_radius[reach / radius])
+        print(f"| {reach:g} m | {values} |", flush=True)
+    return {
+        "same": same,
+        "cells": cells["focus"] / cells["full"],
+        "quality": float((1 - ratios["focus"] / ratios["full"]).max()),
+        "by radius": by_radius,
+    }
+
+
+def find_excess(found: dict[str, Any], *, poisson: float, flow: float) -> list[str]:
+    """Tell which bounds are exceeded: those of the focus, and differences within it (%).
+
+    `flow` is the difference of velocities beyond that of another mesh of the same detail.
+    """
+    _, heat, others, speed = found["by radius"][1]
+    bounds = {
+        "buildings of the focus that differ": (float(not found["same"]), 0.0),
+        "cells over those of full detail": (found["cells"], MOST_CELLS),
+        "loss of quality in the focus": (found["quality"], MOST_LOSS),
+        "Poisson, difference in the focus (%)": (heat, poisson),
+        "potential flow, difference in the focus beyond other tiles (%)": (speed - others, flow),
+    }
+    return [f"{name}: {value:.3g}; bound: {most:g}" for name, (value, most) in bounds.items() if value > most]
+
+
+def main() -> None:
+    """Measure, and end with 1 where a bound is exceeded."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--size", type=float, default=640.0, help="side of the city (m)")
+    parser.add_argument("--mesh", type=float, default=5.0, help="size of cells in full detail (m)")
+    parser.add_argument("--radius", type=float, default=80.0, help="of the focus (m)")
+    given = parser.parse_args()
+    found = measure(given.folder, given.size, given.mesh, given.radius)
+    if excess := find_excess(found, poisson=3.0, flow=1.5):
+        raise SystemExit("\n".join(excess))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -128,14 +129,16 @@ def read_document(path: Path) -> tuple[dict[str, Any], Callable[[int], NDArray[A
     length, kind = struct.unpack_from("<I4s", data, 20 + size)
     body = data[28 + size :]
     assert (length, kind, document["buffers"]) == (len(body), b"BIN\0", [{"byteLength": len(body)}])
-    types = {5126: ("<f4", 3, "VEC3"), 5125: ("<u4", 1, "SCALAR")}
+    vectors = Counter(one["bufferView"] for one in document["accessors"] if one["type"] != "SCALAR")
+    assert all(n == 1 or "byteStride" in document["bufferViews"][view] for view, n in vectors.items())
+    dtypes, widths = {5126: "<f4", 5125: "<u4"}, {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 
     def take(k: int) -> NDArray[Any]:
         accessor = document["accessors"][k]
-        dtype, width, name = types[accessor["componentType"]]
+        dtype, width = dtypes[accessor["componentType"]], widths[accessor["type"]]
         view = document["bufferViews"][accessor["bufferView"]]
         start, n = accessor.get("byteOffset", 0), width * accessor["count"]
-        assert accessor["type"] == name
+        assert view.get("byteStride", 4 * width) == 4 * width
         assert start + 4 * n <= view["byteLength"]
         return np.frombuffer(body, dtype, n, view.get("byteOffset", 0) + start)
 

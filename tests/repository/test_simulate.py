@@ -2,9 +2,13 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.benchmarks.countries import COUNTRIES
 from tests.benchmarks.recorded import recorded_stages
 from tests.benchmarks.simulate import run_disk, run_virtual
+from tests.benchmarks.simulate_blocks import record, simulate
+from tests.helpers.synthetic import city_files
 
 
 def test_every_country_has_its_recorded_tiles() -> None:
@@ -29,3 +33,17 @@ def test_a_small_country_goes_on_from_its_half(tmp_path: Path) -> None:
     half = told["first_half"]["tasks"]
     assert half < told["tasks"]
     assert half <= told["reused"] < told["tasks"]  # what was in flight when it stopped was done too
+
+
+@pytest.mark.long
+def test_a_country_of_blocks_has_the_cells_of_its_tiles(tmp_path: Path) -> None:
+    files = city_files(tmp_path / "city", size=2000.0, buildings=200, density=0.0)
+    recorded, sample, seconds = record(Path(files["footprints"]), tmp_path)
+    own = sum(recorded["sort_buildings", tile][0] for tile in sample)
+    (tmp_path / "country").mkdir()
+    tiles = [(i, j) for i in range(sample[0][0], sample[0][0] + 4) for j in range(sample[0][1], sample[0][1] + 4)]
+    told = simulate(recorded, sample, tiles, tmp_path / "country")
+    assert (len(sample), told["buildings"]) == (4, 4 * own)
+    cells = sum(len(one.number) for (step, _), one in recorded.items() if step == "make_cells")
+    assert 0.8 < told["cells"] / (4 * cells) < 1.1  # those on the sides of the town are joined with their copies
+    assert seconds > 0

@@ -1,6 +1,7 @@
 """Zones of detail in one run: levels by the points of houses, the focus as without, proved from the files."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import shapely
 
 from pipeline.data.citymodel import Prisms
 from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import Boundary, Marker
+from tests.benchmarks.lod_zones import find_excess, measure
 from tests.helpers.tiles import (
     CRS,
     hash_files,
@@ -22,7 +25,10 @@ from tests.helpers.tiles import (
     terraces,
     write_town,
 )
-from tiler.check.zone_proofs import check_zones
+from tiler.check.check_piece import read_piece
+from tiler.check.proofs import Finding, join_findings, make_surface
+from tiler.check.size_proofs import check_sizes_of_zones, prove_sizes_of_zones, zone_finer
+from tiler.check.zone_proofs import check_zones, read_given_blocks
 from tiler.citymodels.tables import unpack_buildings
 from tiler.config.config import make_config
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
@@ -34,7 +40,8 @@ from tiler.planning.own_stages import OwnStages
 from tiler.planning.plan import make_plan
 from tiler.planning.region import Region
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
-from tiler.store.run_folder import read_run_record
+from tiler.store.results import StoredTerrain
+from tiler.store.run_folder import RoofRules, RunRecord, SizesAsked, read_run_record
 from tiler.store.store import Store
 from tiler.workflow.stage_sequence import make_engine
 
@@ -68,11 +75,21 @@ def models(out: Path) -> dict[str, tuple[bytes, ...]]:
 
 
 def prove_levels(
-    text: str, zones: Zones, out: Path, folder: Path, stated: dict[str, int] | None = None
+    text: str,
+    zones: Zones,
+    out: Path,
+    folder: Path,
+    stated: dict[str, int] | None = None,
+    *,
+    lower: float = 0.0,
+    clearance: float = 2.0,
 ) -> set[str]:
-    """Faults of a city model in place of that of a run."""
+    """Faults of a city model in place of that of a run, as if blocks were given lower (m)."""
     (folder / CITY_MODEL).write_text(text)
-    proof = check_zones(zones, folder / CITY_MODEL, out / FULL_CITY_MODEL, stated)
+    rules = RoofRules(raised=clearance, clearance=clearance)
+    given = read_given_blocks(out / STORE, StoredTerrain(out / STORE), rules)
+    given = replace(given, rows={name: (row[0], row[1] - lower, *row[2:]) for name, row in given.rows.items()})
+    proof = check_zones(zones, folder / CITY_MODEL, out / FULL_CITY_MODEL, stated, given)
     return {fault.kind for fault in proof.faults}
 
 
@@ -98,7 +115,15 @@ def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path:
     assert set(shown[~built].tolist()) == {0, 1, 2}
     # A building of another level than its zone asks for, one without, and a point elsewhere are found.
     x, y = next(row[LOD_POINT] for row in told.values() if row[LOD] == "1.3")
-    zones = read_run_record(out / RUN_RECORD).zones
+    found = read_run_record(out / RUN_RECORD)
+    zones = found.zones
+    assert faults_of_sizes(out, found) == set()
+    # A zone elsewhere, and one with smaller cells than it has, are found.
+    shifted = shapely.to_wkb(shapely.box(*BOUNDS[:2], BOUNDS[0] + 40, BOUNDS[3]), hex=True)
+    assert faults_of_sizes(out, replace(found, zones=(("2.2", 3.5, shifted), *zones))) == {"zone-too-coarse"}
+    assert faults_of_sizes(out, replace(found, zones=(("2.2", 2.5, zones[0][2]), *zones[1:]))) == {
+        "zone-too-coarse"
+    }
     for was, now, kind in (
         (f'"{LOD}":"1.2"', f'"{LOD}":"1.3"', "level-of-zone"),
         (f'"{LOD}":"2.2"', f'"{LOD}":"1.2"', "level-parts"),
@@ -109,6 +134,39 @@ def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path:
     ):
         assert was in text
         assert kind in prove_levels(text.replace(was, now), zones, out, tmp_path)
+
+
+def faults_of_sizes(out: Path, record: RunRecord) -> set[str]:
+    """Faults of the sizes of zones in the pieces of a run."""
+    found = Finding()
+    for path in sorted((out / "mesh").iterdir()):
+        piece = read_piece(path, out / "boundary" / f"{path.stem}.vtp", record.bounds)
+        one = check_sizes_of_zones(piece.surface, piece.outline, zone_finer(record), record)
+        found = join_findings(found, one)
+    return {fault.kind for fault in prove_sizes_of_zones(found).faults}
+
+
+def test_triangles_on_open_ground_are_no_finer_than_their_zone_asks() -> None:
+    """Right triangles with legs of 5 m."""
+    rows = np.arange(21.0 * 21).reshape(21, 21).astype(np.int32)
+    a, b, c, d = rows[:-1, :-1].ravel(), rows[:-1, 1:].ravel(), rows[1:, 1:].ravel(), rows[1:, :-1].ravel()
+    facets = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
+    y, x = (part.ravel() for part in np.meshgrid(np.arange(21) * 5.0, np.arange(21) * 5.0, indexing="ij"))
+    boundary = Boundary(facets, np.full(len(facets), Marker.TOP, np.int8), np.full(len(facets), -1))
+    surface = make_surface(np.column_stack((x, y, x * 0)), boundary, np.zeros((len(facets), 3)))
+    ring = shapely.get_coordinates(shapely.box(0, 0, 100, 100))
+    outline = np.stack((ring[:-1], ring[1:]), axis=1)
+    for size, mesh_size, kinds in (
+        (5.0, 5.0, set()),
+        (3.0, 5.0, {"zone-too-coarse"}),
+        (15.0, 15.0, {"zone-too-fine"}),
+        (5.0, 15.0, set()),  # as they grow around the zone
+    ):
+        asked = SizesAsked(mesh_size, mesh_size, 1.2, alone=True)
+        zones = (("2.2", size, shapely.to_wkb(shapely.box(30, 30, 70, 70), hex=True)), ("1.2", mesh_size, ""))
+        record = RunRecord("done", (0, 0, 100, 100), 0.0, {}, zones=zones, sizes=asked)
+        found = check_sizes_of_zones(surface, outline, zone_finer(record), record)
+        assert {fault.kind for fault in found.faults} == kinds, size
 
 
 def write_blocks(path: Path, eastern: str = "east") -> None:
@@ -167,6 +225,17 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
     x, y = next(row[LOD_POINT] for row in told.values() if row[LOD] == "1.2")
     assert not prove_levels(text, asked, tmp_path / "out", tmp_path)
     assert prove_levels(text, (*asked[:-1], ("0C", 6.0, "")), tmp_path / "out", tmp_path) == {"level-of-zone"}
+    # A block of another height, level or point than the run was given, and one that it was not given.
+    for was, now, kind in (
+        ('"roof_height":15.0', '"roof_height":15.1', "block-height"),
+        (f'"{LOD}":"0B"', f'"{LOD}":"0C"', "block-level"),
+        ('"members":["east"]', '"members":["west"]', "block-unknown"),
+    ):
+        assert was in text
+        assert kind in prove_levels(text.replace(was, now), asked, tmp_path / "out", tmp_path)
+    # A block that is higher than given stands above level terrain as roofs are raised, or not.
+    for clearance, faults in ((10.0, set()), (9.9, {"block-height"}), (10.1, {"block-height"})):
+        assert prove_levels(text, asked, tmp_path / "out", tmp_path, lower=1, clearance=clearance) == faults
     moved = text.replace(f"[{x!r},{y!r}]", f"[{WEST + 1.5 * SIZE!r},{y!r}]")
     relabelled = text.replace(f'"{LOD}":"0B"', f'"{LOD}":"1.2"', 1)
     stated = {name: sum(row[LOD] == name for row in told.values()) for name in LEVELS}
@@ -217,3 +286,12 @@ def test_zones_depend_on_no_region_and_no_worker(tmp_path: Path) -> None:
     for folder in ("mesh", "boundary"):
         (path,) = (tmp_path / "one" / folder).glob("3786_76179.vt?")
         assert path.read_bytes() == (tmp_path / "less" / folder / path.name).read_bytes()
+
+
+@pytest.mark.long
+def test_a_focus_has_few_cells_and_the_solutions_of_full_detail(tmp_path: Path) -> None:
+    """As docs/lod-zones.md has it of larger cities, in which more cells lie between focus and less detail."""
+    found = measure(tmp_path, 480.0, 8.0, 50.0, tiles=1)
+    assert find_excess(found, poisson=8.0, flow=2.5) == []
+    worse = found | {"same": False, "cells": 0.16, "quality": 0.04}
+    assert len(find_excess(worse, poisson=0.0, flow=-100.0)) == 5

@@ -16,13 +16,14 @@ from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proo
 from tiler.check.check_piece import ANY, GROUND, TOP
 from tiler.check.piece_survey import LoadDtm, PieceTask, Survey, load_survey, survey_piece
 from tiler.check.proofs import Fault, Finding, Proof, Vertices
+from tiler.check.size_proofs import prove_sizes_of_zones
 from tiler.check.solid_proofs import check_crs, check_solids
-from tiler.check.zone_proofs import check_zones
+from tiler.check.zone_proofs import check_zones, read_given_blocks
 from tiler.citymodels.building_index import BuildingIndex, copy_vertices, index_buildings, open_vertices
 from tiler.executors.in_order import check_workers, map_in_order
 from tiler.mesh_files.mesh_parts import report_parts
 from tiler.mesh_files.vtk_files import read_piece_paths
-from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD
+from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.run_folder import PARTS, RunRecord, read_crs, read_run_record
 
 VOLUME_INDEX = "mesh.pvtu"
@@ -140,7 +141,8 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
         claims += models
         if record.zones:
             files_of_models = directory / CITY_MODEL, directory / FULL_CITY_MODEL
-            claims += (check_zones(record.zones, *files_of_models, record.level_counts),)
+            given = read_given_blocks(directory / STORE, load_dtm(directory / STORE), record.roofs)
+            claims += (check_zones(record.zones, *files_of_models, record.level_counts, given),)
         parts = sums.count_parts()
         remarks = (report_parts(parts),) if len(parts) > 1 else ()
         return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)
@@ -279,6 +281,8 @@ def _conclude(
         )
     if record.leaves:
         claims += (cover_proofs.prove_leaves(found["leaves"]),)
+    if record.zones:
+        claims += (prove_sizes_of_zones(found["zones"]),)
     for sides in INTERFACES:
         if (name := f"between {soil_proofs.name_interface(sides)}") in found:
             claims += (soil_proofs.prove_between(found[name], sides),)

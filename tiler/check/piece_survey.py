@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker
+from pipeline.plane_mesh.sizes import Finer
 from stitch.pieces.frontier import Rim
 from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proofs, wall_proofs
 from tiler.check.check_piece import GROUND, Piece, read_piece, take_vertices
 from tiler.check.proofs import Bounds, Dtm, Fault, Finding, Mask, Vertices
+from tiler.check.size_proofs import check_sizes_of_zones, zone_finer
 from tiler.citymodels.building_index import BuildingIndex, open_index
 from tiler.store.out_folder import RUN_RECORD, STORE
 from tiler.store.run_folder import RunRecord, read_run_record
@@ -135,6 +137,7 @@ class Run:
     dtm: Dtm
     cover: "StoredCover | None"
     canopy: "StoredCanopy | None"
+    finer: list[Finer]
 
     def find_levels(self, ground: Vertices) -> NDArray[np.float64]:
         """Level of the water at vertices of the ground (n, 3) (m); NaN where there is none."""
@@ -154,7 +157,7 @@ def open_run(directory: Path, load_dtm: LoadDtm, shared: Path) -> Run:
         cover = StoredCover(store, _boxes(record), record.core, len(record.ground) - 1)
     if record.leaves:
         canopy = StoredCanopy(store, _boxes(record), record.leaf_column)
-    return Run(record, load_dtm(store), cover, canopy)
+    return Run(record, load_dtm(store), cover, canopy, zone_finer(record))
 
 
 def _boxes(record: RunRecord) -> dict[str, Bounds]:
@@ -202,6 +205,8 @@ def _survey(piece: Piece, run: Run, index: BuildingIndex) -> Survey:
         found["levels"], level = cover_proofs.check_levels(ground, levels[: len(ground)]), levels[len(ground) :]
     if run.canopy is not None:
         found["leaves"] = piece.leaves
+    if record.zones:
+        found["zones"] = check_sizes_of_zones(surface, piece.outline, run.finer, record)
     return Survey(
         found=found,
         rows=rows,

@@ -1,6 +1,8 @@
 """The proof of `citystitch check` that each building has the level of detail of the zone of its point."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -9,12 +11,19 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tiler.check.proofs import Fault, Proof, find_faults
+from pipeline.data.roof_forms import find_blocks
+from tiler.check.proofs import Dtm, Fault, Proof, find_faults
 from tiler.citymodels.building_index import BuildingRow, copy_vertices, has_parts, read_building, read_objects
 from tiler.config.zone_levels import find_levels
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
+from tiler.store.run_folder import RoofRules
+from tiler.store.store import Store
 
 WITHIN = 0.002  # m; a point lies in its building's outline, whose coordinates are rounded to 1 mm
+WALL_SAMPLE = 0.5  # m; between the places on walls where the terrain is looked up
+RAISED = 0.02  # m; of a raised roof against these, as outlines are rounded to 1 mm
+ROUNDED = 0.003  # m; heights of the city model are rounded to 1 mm
+BLOCK_ROWS, BATCH = "blocks", 10_000  # stage with the blocks that a run was given; rows that are read at once
 COMMON = 0.01  # m; parts of a house share no longer wall than this where they have one height
 PLANES, BLOCK, TOP = LEVELS.index("2.2"), LEVELS.index("1.2"), LEVELS.index("0A")
 DETAILS = {
@@ -24,11 +33,47 @@ DETAILS = {
     "level-point": f"the point of a building is outside of its outline before simplification; bound: {WITHIN:g} m",
     "level-roof": "a roof slopes, where its building's level has flat ones alone",
     "building-in-block": "the point of a building lies in a block that stands for it",
+    "block-unknown": "a building at a level of blocks is none of those that the run was given",
+    "block-level": "a block has another level or point than the one that the run was given",
+    "block-height": f"a block has not its height above its ground, nor is it raised; bound: {ROUNDED:g} m",
     "level-parts": "parts of a house at level 1.2 share a wall; they are one outline there",
 }
 
 
-def check_zones(zones: Zones, model: Path, full_model: Path, stated: Mapping[str, int] | None = None) -> Proof:
+@dataclass(frozen=True, eq=False)
+class GivenBlocks:
+    """Blocks that a run was given, by id: level, height (m), point; terrain, and how roofs are raised over it."""
+
+    rows: Mapping[str, tuple[int, float, float, float]]
+    dtm: Dtm
+    roofs: RoofRules
+
+
+def read_given_blocks(store: Path, dtm: Dtm, roofs: RoofRules) -> GivenBlocks:
+    """Read the blocks of a run, some at a time; there may be none."""
+    rows: dict[str, tuple[int, float, float, float]] = {}
+    stored = Store(store)
+    for name in stored.names(BLOCK_ROWS):
+        with stored.open(BLOCK_ROWS, name) as found:
+            ends = found.read("id_end") if "id_end" in found.names else np.empty(0, np.int64)
+            for k in range(0, len(ends), BATCH):
+                some = [(k, min(k + BATCH, len(ends)))]
+                start = np.concatenate(([ends[k - 1]] if k else [0], ends[slice(*some[0])]))
+                text = found.read("id", [(int(start[0]), int(start[-1]))]).tobytes()
+                level, place = find_blocks(found.read("forms", some))
+                height = found.read("given_height", some)
+                for i, (first, last) in enumerate(pairwise((start - start[0]).tolist())):
+                    rows[text[first:last].decode()] = (int(level[i]), float(height[i]), *place[i].tolist())
+    return GivenBlocks(rows, dtm, roofs)
+
+
+def check_zones(
+    zones: Zones,
+    model: Path,
+    full_model: Path,
+    stated: Mapping[str, int] | None = None,
+    blocks: GivenBlocks | None = None,
+) -> Proof:
     """Hold points against outlines of houses before they were simplified, and levels against zones.
 
     Parameters
@@ -41,13 +86,15 @@ def check_zones(zones: Zones, model: Path, full_model: Path, stated: Mapping[str
         The city model before it was simplified.
     stated : mapping of str to int, optional
         Building parts at each level by the record of the run, to hold theirs against.
+    blocks : GivenBlocks, optional
+        What blocks are held against.
 
     Raises
     ------
     InputError
         If a file is missing or damaged.
     """
-    found = _Found(zones)
+    found = _Found(zones, blocks)
     for name, thing, building in _iterate(model):
         found.add(name, thing, building)
     return found.prove(full_model, stated)
@@ -65,8 +112,8 @@ def _iterate(path: Path) -> Iterator[tuple[str, Mapping[str, Any], BuildingRow]]
 class _Found:
     """Level and point of each house, and what is wrong with buildings alone."""
 
-    def __init__(self, zones: Zones) -> None:
-        self._zones = zones
+    def __init__(self, zones: Zones, blocks: GivenBlocks | None) -> None:
+        self._zones, self._blocks = zones, blocks
         self._names: list[str] = []
         self._rows: list[tuple[float, float, float, int]] = []
         self._parts: dict[str, list[Any]] = {}
@@ -88,6 +135,9 @@ class _Found:
         self._rows.append((float(point[0]), float(point[1]), building.roof, number))
         if number != PLANES and any(building.plane[:2]):
             self._faults.append(("level-roof", *place))
+        if number > BLOCK and self._blocks is not None:
+            wrong = _look_at_block(self._blocks, values, building, number)
+            self._faults += [(wrong, *place)] if wrong else []
         if level == "1.2" and "parents" in thing:
             self._parts.setdefault(house, []).append(building.footprint)
 
@@ -148,6 +198,31 @@ class _Found:
                         x, y = shapely.get_coordinates(common)[0].tolist()
                         places.append((x, y, 0.0))
         return places
+
+
+def _look_at_block(blocks: GivenBlocks, values: Mapping[str, Any], building: BuildingRow, level: int) -> str:
+    """Hold a block against what the run was given; the kind of fault, if any."""
+    given = [_find_block(blocks, str(name)) for name in values.get("members") or [""]]
+    known = [row for row in given if row is not None]
+    if len(known) < len(given):
+        return "block-unknown"
+    if any(row[0] != level or max(np.abs(np.subtract(row[2:], values[LOD_POINT]))) > WITHIN for row in known):
+        return "block-level"
+    heights = [row[1] for row in known]
+    height = building.roof - building.ground
+    if min(heights) - ROUNDED <= height <= max(heights) + ROUNDED:
+        return ""
+    walls = shapely.get_coordinates(shapely.segmentize(building.footprint, WALL_SAMPLE))
+    raised = building.roof - float(blocks.dtm.sample(walls).max())
+    within = blocks.roofs.raised - RAISED <= raised <= blocks.roofs.clearance + RAISED
+    return "" if height > max(heights) and within else "block-height"
+
+
+def _find_block(blocks: GivenBlocks, name: str) -> tuple[int, float, float, float] | None:
+    """Find a block by the name of its footprint, which has a number behind it where it is a part of several."""
+    while name not in blocks.rows and name.rpartition("-")[2].isdecimal():
+        name = name.rpartition("-")[0]
+    return blocks.rows.get(name)
 
 
 def _fault(kind: str, places: NDArray[np.float64]) -> list[Fault]:

@@ -7,9 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.facades.pictures import Picture
+
 # What a face is; outlines are polygons that say where a building stands, without being a part of its surface.
 UNKNOWN, ROOF, GROUND, WALL, OUTLINE = range(5)
-WINDOW, DOOR, INSTALLATION = range(5, 8)  # of buildings that rules have detailed; files are read without them
+# Of buildings that rules have detailed; files are read without them. The last are flat, with a picture each.
+WINDOW, DOOR, INSTALLATION, PICTURED = range(5, 9)
 KINDS = {
     "RoofSurface": ROOF,
     "OuterCeilingSurface": WALL,
@@ -65,6 +68,7 @@ class ModelBuilding:
     attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     # Owners that are installations: the building or part of each, by id.
     installations: Mapping[str, str] = field(default_factory=dict)
+    pictures: Sequence[Picture] = ()  # of faces of kind `PICTURED`, in their order
 
 
 @dataclass

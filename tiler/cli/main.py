@@ -472,6 +472,14 @@ def _generalise(options: argparse.Namespace) -> int:
     from tiler.generalisation.options import read_options
 
     inputs, asked = read_options(vars(options))
+    if options.plan:
+        from tiler.generalisation.plan import plan_generalisation
+
+        for line in plan_generalisation(inputs, asked):
+            say(line)
+        return 0
+    if options.output is None:
+        raise ConfigError("generalise: nothing says where to write; give -o FILE.gpkg, or --plan")
     words = {"workers": options.workers, "overwrite": options.overwrite}
     return _tell(generalise(inputs, options.output, asked, **words), options.output)
 

@@ -662,10 +662,11 @@ def _add_generalise(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--footprints", type=_on_disk, metavar="FILE", help="vector file of buildings instead")
     parser.add_argument(
-        "-o", "--output", type=_on_disk, required=True, metavar="FILE.gpkg",
+        "-o", "--output", type=_on_disk, metavar="FILE.gpkg",
         help="GeoPackage of all levels; FILE.city.json and FILE.levels.json go beside it",
     )  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace the files if they exist")
+    parser.add_argument("--plan", action="store_true", help="forecast time and memory, and write nothing")
     _add_workers(parser, "work on squares")
     source = parser.add_argument_group("buildings")
     source.add_argument("--layer", default="", help="layer of --footprints (default: the only one)")

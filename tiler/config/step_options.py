@@ -1,5 +1,6 @@
 """From the parameters of a run to the options of the steps, and which parameters each of these needs."""
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import shapely
@@ -175,17 +176,23 @@ def size_rule(given: Any, largest: float) -> SizeRule:
 
 
 def is_refined(given: Any) -> bool:
-    """Whether walls or areas are finer than the rest; of a run with zones, before its areas are read, too."""
-    zoned = isinstance(given, Config) and given.zoned
-    return bool(_optional(given, "wall_size", 0.0) or _optional(given, "refinements", ()) or zoned)
+    """Whether walls or areas are finer than the rest; of a run as asked for, before its areas are read, too."""
+    if isinstance(given, Config):
+        return given.refined
+    return bool(_optional(given, "wall_size", 0.0) or _optional(given, "refinements", ()))
 
 
 def refined_areas(given: Any) -> list[Finer]:
     """Areas that are finer than the rest, those of one size together."""
     areas = _optional(given, "refinements", ())
+    return make_finer(areas, given.refine_growth) if areas else []
+
+
+def make_finer(areas: Sequence[tuple[float, str]], growth: float) -> list[Finer]:
+    """Put areas of one size together: size (m) and well-known binary in hexadecimal digits of each."""
     sizes = sorted({size for size, _ in areas})
     shapes = {size: shapely.from_wkb([text for other, text in areas if other == size]) for size in sizes}
-    return [Finer(size, given.refine_growth - 1, shapely.STRtree(shapes[size])) for size in sizes]
+    return [Finer(size, growth - 1, shapely.STRtree(shapes[size])) for size in sizes]
 
 
 def is_covered(given: Any) -> bool:

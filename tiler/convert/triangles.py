@@ -1,6 +1,6 @@
 """Buildings at one level of detail as triangles, for formats of surfaces."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.facades.pictures import Picture
 from tiler.cityinput.face_planes import cut_face
-from tiler.cityinput.faces import Faces
+from tiler.cityinput.faces import PICTURED, Faces
 from tiler.cityinput.levels import list_attempts
 from tiler.convert.features import plain_value, rings_of
 from tiler.convert.inputs import ModelSource
@@ -25,6 +26,8 @@ class SolidBuilding:
     # (t, 3): their corners, counter-clockwise seen from the side that the faces look to
     triangles: NDArray[np.int64]
     kind: NDArray[np.int8]  # (t,): kind of the face that each is of
+    pictures: Sequence[Picture]  # of faces of kind `PICTURED`
+    picture: NDArray[np.int64]  # (p,): which of them each triangle of that kind shows
 
 
 def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
@@ -37,29 +40,31 @@ def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
         faces = attempts[0][1]
         xyz, number = np.unique(np.round(faces.xyz / source.step), axis=0, return_inverse=True)
         xyz = xyz * source.step
-        triangles, kind, n_fans = triangulate(faces, xyz, number.ravel().tolist())
+        triangles, face, n_fans = triangulate(faces, xyz, number.ravel().tolist())
         source.told["faces that cross themselves, cut into triangles around a corner"] += n_fans
         parts = [own for owner, own in building.attributes.items() if owner not in building.installations]
         attributes = {key: value for own in parts for key, value in own.items()}
         attributes |= building.attributes.get(building.id, {})
         kept = {key: plain_value(value) for key, value in attributes.items()}
         if len(triangles):
-            yield SolidBuilding(building.id, kept, xyz, triangles, kind)
+            kind, shown = faces.kind[face], np.cumsum(faces.kind == PICTURED) - 1
+            picture = shown[face[kind == PICTURED]]
+            yield SolidBuilding(building.id, kept, xyz, triangles, kind, building.pictures, picture)
 
 
 def triangulate(
     faces: Faces, xyz: NDArray[np.float64], number: list[int]
-) -> tuple[NDArray[np.int64], NDArray[np.int8], int]:
+) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
     """Cut faces, polygons with holes, into triangles.
 
     `xyz`, float64 (n, 3), are places, each there once, and `number` says which of them each vertex of the faces is
-    at. Gives corners of triangles as rows of `xyz`, int64 (t, 3), kinds of their faces, int8 (t,), and how many
-    faces are no polygons in their plane: triangles meet in their first corner.
+    at. Gives corners of triangles as rows of `xyz`, int64 (t, 3), their faces, int64 (t,), and how many faces are
+    no polygons in their plane: triangles meet in their first corner.
     """
     found: list[list[int]] = []
-    kinds: list[int] = []
+    of: list[int] = []
     n_fans = 0
-    for kind, rings in rings_of(faces, number):
+    for k, (_, rings) in enumerate(rings_of(faces, number)):
         if not rings:
             continue
         parts = [rings[0]] if len(rings) == 1 and len(rings[0]) == 3 else cut_face(rings, xyz)
@@ -67,5 +72,5 @@ def triangulate(
             n_fans += 1
             parts = [[rings[0][0], a, b] for a, b in pairwise(rings[0][1:])]
         found += parts
-        kinds += [kind] * len(parts)
-    return np.array(found, np.int64).reshape(-1, 3), np.array(kinds, np.int8), n_fans
+        of += [k] * len(parts)
+    return np.array(found, np.int64).reshape(-1, 3), np.array(of, np.int64), n_fans

@@ -72,7 +72,9 @@ def detail_models(inputs: Sequence[Path], output: Path, asked: DetailAsked) -> l
     with open_source(inputs, crs=asked.crs, axis_order=asked.axis_order) as plain:
         if plain.in_degrees:
             raise ConfigError("coordinates are degrees, and rules in metres; give --crs EPSG:NNNN")
-        source = detail_source(plain, graph, tuple(criteria.values()), lod=asked.lod)
+        source = detail_source(
+            plain, graph, tuple(criteria.values()), lod=asked.lod, pictured=output.suffix == ".glb"
+        )
         with replacing(output) as part:
             _write(part, output.suffix, source)
         table = make_table(source.counts, tuple(criteria))

@@ -23,10 +23,12 @@ from pipeline.facades.facade import (
     make_facade,
 )
 from pipeline.facades.graph import Graph, InsertLod
+from pipeline.facades.pictures import Picture
 from tiler.cityinput.face_planes import area_vectors, find_planes
 from tiler.cityinput.faces import (
     DOOR,
     INSTALLATION,
+    PICTURED,
     UNKNOWN,
     WALL,
     WINDOW,
@@ -66,6 +68,7 @@ class DetailedSource(ModelSource):
     # The first keeps everything, the second is what is made; others are counted alone.
     criteria: tuple[Criteria, ...]
     lod: str = "auto"  # which level buildings are taken at: see `tiler.cityinput.levels.CHOICES`
+    pictured: bool = False  # whether what is flat has pictures
     # Buildings, façades, assets, and polygons by criterion (``"polygons 0"`` and so on), ``"low assets"``, ``"low
     # facades"``; each reading counts anew.
     counts: Counter[str] = field(default_factory=Counter)
@@ -91,27 +94,29 @@ class DetailedSource(ModelSource):
         front = max(walls, key=lambda wall: round(wall.width, 3), default=None)
         faces = join_faces(shape.faces for shape in shapes)
         obstacles, first = _obstacles(faces), np.cumsum([0, *(len(shape.faces) for shape in shapes)]).tolist()
-        made: dict[tuple[int, int], Made] = {}
+        made: dict[tuple[int, int], tuple[Facade, list[Product], Made]] = {}
         for wall in walls:
             start = self.graph.front if wall is front else self.graph.other
             products = self._execute(wall, start, obstacles, first[wall.shape] + wall.face)
-            made[wall.shape, wall.face] = self._make(products)
+            made[wall.shape, wall.face] = wall, products, self._make(products)
         self._count_plain(len(faces) - len(walls))
-        frames = {(wall.shape, wall.face): wall.frame for wall in walls}
+        pictures: list[Picture] = []
         detailed: list[Shape] = []
         installations: dict[str, str] = {}
         attributes = dict(building.attributes)
         for k, shape in enumerate(shapes):
             done = FaceList()
             for j, (rings, kind) in enumerate(zip(_rings(shape.faces), shape.faces.kind.tolist(), strict=True)):
-                found = made.get((k, j))
-                if found is None:
+                if (k, j) not in made:
                     done.add(rings, kind)
                     continue
-                frame = frames[k, j]
-                done.add([*rings, *_place(frame, [found.wall])[0]], WALL)
-                for one, own in zip(found.surfaces, _place(frame, found.surfaces), strict=True):
-                    done.add(own, KINDS[one.kind])
+                wall, products, found = made[k, j]
+                frame = wall.frame
+                shown = _find_pictures(wall, products, found) if self.pictured else {}
+                pictures += shown.values()
+                done.add([*rings, *_place(frame, [found.wall])[0]], PICTURED if -1 in shown else WALL)
+                for n, own in enumerate(_place(frame, found.surfaces)):
+                    done.add(own, PICTURED if n in shown else KINDS[found.surfaces[n].kind])
                 for parts in found.installations:
                     name = f"{shape.owner}-balcony-{len(installations) + 1}"
                     installations[name] = shape.owner
@@ -121,7 +126,13 @@ class DetailedSource(ModelSource):
                         balcony.add(own, INSTALLATION)
                     detailed.append(Shape(name, LEVEL, True, balcony.done()))
             detailed.append(replace(shape, lod=LEVEL, faces=done.done()))
-        return replace(building, shapes=tuple(detailed), attributes=attributes, installations=installations)
+        return replace(
+            building,
+            shapes=tuple(detailed),
+            attributes=attributes,
+            installations=installations,
+            pictures=pictures,
+        )
 
     def _find_facades(self, number: int, shape: Shape) -> Iterator[Facade]:
         areas = area_vectors(shape.faces.xyz, shape.faces.ring_start)[shape.faces.face_start[:-1]]
@@ -171,15 +182,32 @@ class DetailedSource(ModelSource):
         self.counts.update(dict.fromkeys(keys, number))
 
 
+def _find_pictures(wall: Facade, products: list[Product], made: Made) -> dict[int, Picture]:
+    """Give the pictures of the flat surfaces of a façade, by their number; of a plain wall with assets as -1."""
+    if products and not made.surfaces:
+        assets = [(one.insert, one.corner) for one in products]
+        return {-1: Picture(wall.frame, (wall.width, wall.height), assets)}
+    corners = wall.frame.place(np.array([(u, 0.0, v) for _, (u, v) in made.flat.values()]).reshape(-1, 3))
+    return {
+        n: Picture(replace(wall.frame, origin=origin), (insert.width, insert.height), [(insert, (0.0, 0.0))])
+        for (n, (insert, _)), origin in zip(made.flat.items(), corners, strict=True)
+    }
+
+
 def detail_source(
-    source: ModelSource, graph: Graph, criteria: tuple[Criteria, ...], *, lod: str = "auto"
+    source: ModelSource,
+    graph: Graph,
+    criteria: tuple[Criteria, ...],
+    *,
+    lod: str = "auto",
+    pictured: bool = False,
 ) -> DetailedSource:
-    """Detail a source; its box grows by how far assets reach out of walls."""
+    """Detail a source; its box grows by how far assets reach out of walls. `pictured`: flat ones get pictures."""
     out = max((reach(node.insert)[0] for node in graph.nodes.values() if isinstance(node, InsertLod)), default=0.0)
     grown = np.array([out, out, 0.0])
     return DetailedSource(
         source.files, source.crs, source.low - grown, source.high + grown, source.notes, Counter(),
-        graph, criteria, lod,
+        graph, criteria, lod, pictured,
     )  # fmt: skip
 
 

@@ -67,6 +67,8 @@ class RoofRules:
         Whether the least distance of two nodes may be more than the step, so that the upper one is raised.
     slack : float
         How far a roof may be moved besides, where the boundary's `ROOF_MOVED` says so (m).
+    raised : float
+        Height above the terrain at its walls up to which the city model raises a flat roof, at least (m).
     """
 
     sloped: bool = False
@@ -75,9 +77,30 @@ class RoofRules:
     joined: float = 0.0
     lifts: bool = False
     slack: float = 0.0
+    raised: float = 0.0
 
 
 FLAT_ROOFS = RoofRules()
+
+
+@dataclass(frozen=True)
+class SizesAsked:
+    """Target edge lengths of a run beside those of its zones.
+
+    Attributes
+    ----------
+    mesh_size, largest : float
+        That outside of zones, and the largest one in the open (m).
+    growth : float
+        Growth from edge to edge around zones.
+    alone : bool
+        Whether nothing else makes triangles finer: walls, further areas, land cover.
+    """
+
+    mesh_size: float = 10.0
+    largest: float = 10.0
+    growth: float = 1.2
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -121,6 +144,8 @@ class RunRecord:
         Zones of detail; none where all buildings have one level.
     level_counts : mapping of str to int
         Building parts at each level of detail, where there are zones.
+    sizes : SizesAsked
+        Other sizes, where there are zones.
     """
 
     status: str
@@ -140,6 +165,7 @@ class RunRecord:
     zones: Zones = ()
     level_counts: Mapping[str, int] = field(default_factory=dict)
     solids: bool = False
+    sizes: SizesAsked = SizesAsked()
 
     @property
     def regions(self) -> Regions:
@@ -213,6 +239,7 @@ def read_run_record(path: Path) -> RunRecord:
         if not zones and (given.get("focus") or given.get("lod_zones")):
             raise InputError(f"{path}: its parameters name zones of detail, and the zones are missing; run again")
         at_levels = {level: int(record["counts"].get(f"parts at level {level}", 0)) for level in LEVELS}
+        sizes = _read_sizes(given) if zones else SizesAsked()
         spacing = float(given.get("dtm_spacing", 1.0))
         ground = tuple(GroundPatch(str(row["patch"]), _optional(row["z0 (m)"])) for row in found)
     except WRONG_FIELD as error:
@@ -239,6 +266,7 @@ def read_run_record(path: Path) -> RunRecord:
         zones,
         at_levels,
         solids,
+        sizes,
     )
 
 
@@ -257,7 +285,14 @@ def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:
         joined=Weld.least / 2,
         lifts=least > Weld.least,
         slack=Weld.slack,
+        raised=float(parameters["roof_clearance"]),
     )
+
+
+def _read_sizes(given: Mapping[str, Any]) -> SizesAsked:
+    size, others = float(given["mesh_size"]), ("wall_size", "refine", "refine_areas", "land_cover", "water_points")
+    alone = not any(given.get(name) for name in others)
+    return SizesAsked(size, max(size, float(given["open_size"])), float(given["refine_growth"]), alone)
 
 
 def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:

@@ -16,6 +16,7 @@ from pipeline.columns.spacing import TALLEST, SpacingLimits, column_spacing, mea
 from pipeline.data.errors import CityError, ConfigError, InputError
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.plane_mesh.sizes import Finer, SizeRule, local_sizes, size_field
+from stitch.seams.tiles import sizes_halo
 from stitch.tiling.grid import Key, make_grid
 from stitch.tiling.walls import LONGEST_PIECE, cut_walls
 from tests.helpers.cities import city_of, crowded_blocks
@@ -33,6 +34,7 @@ from tests.helpers.tiles import CRS, hash_files, make_town, prove, run_of, write
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import build_parser
 from tiler.config.config import Config, idle_parameters, make_config, read_refinement
+from tiler.config.step_options import size_rule
 from tiler.planning.footprint_sample import sample_footprints
 from tiler.planning.forecast import forecast_run
 from tiler.planning.plan import survey_inputs
@@ -148,6 +150,11 @@ def test_only_a_refined_mesh_depends_on_what_is_refined() -> None:
     halos = [{read.stage: read.halo for read in stages[0].reads} for stages in (plain, finer)]
     # Walls count (10 - 2) / 0.2 m beyond the places whose sizes are asked for.
     assert halos[1]["model"] >= halos[0]["model"] + 40
+    # Boxes, areas and zones count as far as those of tasks, which know no other halo than that of their rule.
+    for values in ({"refine": ["0,0,9,9,2"]}, {"refine_areas": "a.gpkg"}, {"focus": "0,0,9"}):
+        config = make_config(values)
+        (halo,) = (read.halo for read in mesh_stages(config)[0].reads if read.stage == "model")
+        assert halo == sizes_halo(config.tile_size_or_default, size_rule(config, 0.0)) > halos[0]["model"]
     assert idle_parameters(make_config({"wall_growth": 1.3, "refine_growth": 1.3, "refine_attribute": "a"})) == [
         "wall_growth = 1.3 has no effect: it counts with wall_size above 0",
         "refine_growth = 1.3 has no effect: it counts with refine, refine_areas, focus, lod_zones",

@@ -1,11 +1,15 @@
 """`citystitch detail`: a gabled house by rules, read again by schemas, ISO 19107 and the reader of GLB."""
 
 import json
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 
 import tiler
 from tests.conftest import SHARED
@@ -130,6 +134,46 @@ def test_a_glb_has_materials_for_openings(house: Path) -> None:
     assert [node["extras"] for node in document["nodes"]] == [{"measuredHeight": 7.0}]  # not that of the balcony
     # A frame with two holes is 14 triangles, by Euler's formula, a pane in each is 2.
     assert len(used["window"]) == 3 * 4 * (14 + 2 * 2)
+
+
+def test_flat_facades_and_assets_of_a_glb_show_pictures_of_their_assets(house: Path) -> None:
+    whole = detail(house, "a.glb", "--viewpoint", "0,0,0")
+    single = detail(house, "b.glb", "--viewpoint", "0,0,0", "--keep", "balcony=100")  # the wall has a balcony
+    for path, names in ((whole, ("wall", "window", "door")), (single, ("window", "door"))):
+        page, xyz, uv = read_pictures(path)
+        # On the front, from its lower left corner on: x and y (m).
+        for name in names:
+            x, y = {"wall": (0.3, 0.5), "window": (2.0, 1.5), "door": (5.5, 1.0)}[name]
+            found = []
+            for corners, places in zip(xyz, uv, strict=True):
+                weight = np.linalg.lstsq((corners[1:] - corners[0])[:, :2].T, [x, y] - corners[0, :2])[0]
+                if np.ptp(corners[:, 2]) < 1e-6 < corners[0, 2] and min(*weight, 1 - weight.sum()) >= 0:
+                    u, v = (places[0] + weight @ (places[1:] - places[0])) * len(page)
+                    found.append(page[int(v), int(u)].tolist())
+            (red, _, blue) = found[0]
+            assert {"wall": red > 220, "window": blue > red + 15, "door": red > blue + 30}[name], (path, name)
+    assert detail(house, "c.glb", "--viewpoint", "0,0,0").read_bytes() == whole.read_bytes()
+
+
+def read_pictures(path: Path) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Read the page of a file, and the triangles that show it: corners, from the building's corner, and places."""
+    document, take = read_document(path)
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    data = path.read_bytes()
+    start = len(data) - document["buffers"][0]["byteLength"] + view["byteOffset"]
+    page = np.asarray(Image.open(BytesIO(data[start : start + view["byteLength"]])), np.int64)
+    assert all("byteStride" in document["bufferViews"][k] for k in (0, 2))  # which accessors share
+    (shown,) = (one for one in document["meshes"][0]["primitives"] if "TEXCOORD_0" in one["attributes"])
+    surface = document["materials"][shown["material"]]["pbrMetallicRoughness"]
+    assert surface["baseColorTexture"] == {"index": 0}
+    corners = take(shown["indices"])
+    xyz, uv = (
+        take(shown["attributes"][name]).reshape(-1, n)[corners].reshape(-1, 3, n)
+        for name, n in (("POSITION", 3), ("TEXCOORD_0", 2))
+    )
+    assert 0 <= uv.min() < uv.max() <= 1
+    xyz[:, :, 2] -= xyz[:, :, 2].max() - 1
+    return page, xyz, uv
 
 
 @pytest.mark.parametrize(

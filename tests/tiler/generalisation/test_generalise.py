@@ -290,6 +290,19 @@ def test_workers_write_the_same_bytes(files: list[str], tmp_path: Path) -> None:
     assert bytes_of(alone) == bytes_of(make(tmp_path / "two.gpkg", files, "--workers", "2"))
 
 
+def test_a_plan_counts_buildings_and_writes_nothing(
+    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(tmp_path.iterdir())
+    assert main(["generalise", *files, "--plan", "--tile-size", "100"]) == 0
+    told = capsys.readouterr().out
+    assert "12 buildings in " in told
+    assert "memory: some 260 MB a process, and 0 to 0 MB in the first" in told
+    assert sorted(tmp_path.iterdir()) == before
+    assert main(["generalise", *files]) == 2
+    assert "give -o FILE.gpkg, or --plan" in capsys.readouterr().err
+
+
 def test_what_cannot_be_done_is_one_clear_error(
     files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
