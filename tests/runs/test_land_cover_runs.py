@@ -5,14 +5,18 @@ import re
 from pathlib import Path
 from typing import Any
 
+import h5py
 import laspy
+import meshio
 import numpy as np
 import pyogrio
 import pytest
+import pyvista
 import shapely
 
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
+from stitch.pieces.conformity import compute_cell_volumes
 from tests.helpers.foam_reader import read_field, read_poly_mesh
 from tests.helpers.programs import mesh_is_ok, run_foam
 from tests.helpers.tiles import hash_files
@@ -119,6 +123,32 @@ def test_check_proves_patches_water_and_leaves(covered_run: Path) -> None:
     assert (measured < 9.5).sum() > 10
     assert not ((measured > 9.5) & (measured < 14)).any()
     assert np.abs(middle[measured < 9.5, 2] - 25).max() < 8
+
+
+@pytest.mark.parametrize("options", [{}, {"cells": "hybrid"}])
+def test_msh_and_cgns_have_the_leaf_area_of_each_cell(
+    covered_run: Path, tmp_path: Path, options: dict[str, str]
+) -> None:
+    volumes = [read_vtu(path) for path in find_files(covered_run).volumes]
+    found = {
+        "": sum(float(p.cell_data["lad"] @ compute_cell_volumes(p.mesh.points, p.mesh.cells)[0]) for p in volumes)
+    }
+    for name in ("msh", "cgns"):
+        export_run(covered_run, path := tmp_path / f"a.{name}", name=name, options=options)
+        if name == "msh":
+            mesh = meshio.read(path)
+            kinds = {"tetra": 10, "pyramid": 14, "wedge": 13}
+            blocks = {k: (kinds[k], rows) for k, rows in mesh.cells_dict.items() if k in kinds}
+            assert not mesh.cell_data_dict["lad"]["triangle"].any()
+            leaves = np.concatenate([mesh.cell_data_dict["lad"][kind] for kind in blocks])
+            grid = pyvista.UnstructuredGrid(dict(blocks.values()), mesh.points - (X, Y, 0))
+        else:
+            with h5py.File(path) as file:
+                leaves = file["city/air/Leaves/lad/ data"][:]
+        found[name] = float(leaves @ grid.compute_cell_sizes()["Volume"])  # cells are in one order in both
+    assert found["cgns"] == found["msh"]
+    # The leaves of a prism are those of its middle tetrahedron; a few crowns are less than three hundred cells.
+    assert found["msh"] == pytest.approx(found[""], rel=0.3 if options else 1e-9)
 
 
 @pytest.mark.long

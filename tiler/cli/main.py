@@ -187,8 +187,8 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    if options.workers and (options.store or options.cfd):
-        raise ConfigError("--workers: goes with check alone, not with --store or --cfd; leave it out")
+    if options.workers and (options.store or options.cfd or options.export):
+        raise ConfigError("--workers: goes with check alone, not with --store, --cfd or --export; leave it out")
     if options.store:
         from tiler.workflow.audit import audit_run
 
@@ -202,6 +202,10 @@ def _check(options: argparse.Namespace) -> int:
         return _print_proof(check_guidelines(options.directory, options.direction or [WEST]))
     if options.direction:
         raise ConfigError("--direction: is for check --cfd; give that too")
+    if options.export:
+        from tiler.check.export_proofs import check_export
+
+        return _print_proof(check_export(options.directory, options.export))
     return _check_folder(options.directory, options.workers)
 
 

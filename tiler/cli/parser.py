@@ -455,6 +455,13 @@ def _add_check(check: argparse.ArgumentParser) -> None:
         action="store_true",
         help="instead compare domain and cells with the guidelines for wind simulations of COST 732 and AIJ",
     )
+    what.add_argument(
+        "--export",
+        type=Path,
+        metavar="PATH",
+        help="instead prove an exported mesh of any cells against the run: a file .vtu or .msh, or a case folder "
+        "of OpenFOAM",
+    )
     _add_workers(check, "check pieces")
     check.add_argument(
         "--direction",

@@ -1,5 +1,6 @@
 """Files of OpenFOAM: headers, and long lists in binary, written in any order of their rows."""
 
+import re
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -7,6 +8,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.errors import InputError
 from tiler.export.pieces import blocks_of, slices
 
 BANNER = "// Written by citystitch.\n"
@@ -141,3 +143,42 @@ class FoamFaces:
 
     def _seek(self, face: int) -> None:
         self._file.seek(self._start + 3 * face * self._dtype.itemsize)
+
+
+def read_foam_list(path: Path, width: int) -> NDArray[Any]:
+    """Read a binary list: vectors (n, 3), or labels (n, 1) for a width of 1; InputError where it is damaged."""
+    (rows,) = _read_lists(path, [("f8", 3) if width == 3 else ("", 1)])
+    return rows
+
+
+def read_foam_faces(path: Path) -> NDArray[np.int64]:
+    """Read faces of three and four corners, (k, 4); -1 in the last place of a triangle."""
+    start, corners = (rows[:, 0] for rows in _read_lists(path, [("", 1), ("", 1)]))
+    width = np.diff(start)
+    if not len(start) or start[0] != 0 or start[-1] != len(corners) or not np.isin(width, (3, 4)).all():
+        raise InputError(f"{path}: has faces that are no triangles or quadrilaterals; export the case again")
+    faces = np.full((len(width), 4), -1)
+    faces[np.arange(4) < width[:, None]] = corners
+    return faces
+
+
+def _read_lists(path: Path, kinds: list[tuple[str, int]]) -> list[NDArray[Any]]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); export the case again") from None
+    bits = re.search(rb"label=(32|64)", data[:2000])
+    at, found = data.find(b"}") + 1, []
+    for kind, width in kinds:
+        head = re.compile(rb"\s*(\d+)\s*\(").match(data, at)
+        dtype = np.dtype(f"<{kind or f'i{int(bits[1]) // 8}'}") if bits else None
+        if head is None or dtype is None or b"binary" not in data[:2000]:
+            raise InputError(f"{path}: is no binary list of OpenFOAM; export the case again")
+        n = int(head[1]) * width
+        at = head.end() + n * dtype.itemsize
+        if data[at : at + 1] != b")":
+            raise InputError(f"{path}: ends early; export the case again")
+        rows = np.frombuffer(data, dtype, n, head.end()).reshape(-1, width)
+        found.append(rows.astype(np.float64 if kind else np.int64))
+        at += 1
+    return found

@@ -1,6 +1,6 @@
 """OpenFOAM's polyMesh of prisms and other cells, whole or decomposed: faces of three and of four corners."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,14 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
+from pipeline.data.mesh import is_ground
+from stitch.pieces.conformity import group_rows
 from tiler.export.bisection import bisect_columns, column_centres, count_columns
 from tiler.export.foam_files import LABEL_LIMIT, FoamList, foam_header
 from tiler.export.foam_part import PartCounts, count_distances, leaves_beside
 from tiler.export.foam_patches import (
+    FIRST_LEAVES,
+    GROUND_ZONE,
     POLY_MESH,
     ZonesFile,
     add_all_leaves,
     cell_zone_name,
+    face_zone_name,
+    is_house,
     leaf_key,
     patch_keys,
     patch_of_key,
@@ -39,6 +45,9 @@ class _Part:
         Its cells, points and faces but those towards other parts; the boundary patch by patch.
     keys : int64, (f,)
         Key of the patch of each face of the boundary.
+    zones : int64, (i + f,), or None
+        Key of the face zone of each inner face and of each of the boundary, -1 for none; None without
+        zones.
     others : mapping of int to int
         Faces towards each other part.
     across, across_cell : int64, (a, 4) and (a,)
@@ -50,6 +59,7 @@ class _Part:
     number: int
     mesh: PrismMesh
     keys: Ints
+    zones: Ints | None
     others: Mapping[int, int]
     across: Ints
     across_cell: Ints
@@ -61,6 +71,7 @@ def write_foam_prisms(
     mesh: PrismMesh,
     *,
     by_building: bool = False,
+    by_zone: bool = False,
     heights: Path | None = None,
     parts: int | None = None,
 ) -> list[PartCounts]:
@@ -74,6 +85,8 @@ def write_foam_prisms(
         The mesh.
     by_building : bool
         Whether each building has a patch of its own.
+    by_zone : bool
+        Whether each building has a face zone beside the patches.
     heights : Path, optional
         An existing folder for the heights of the centres of cells (m), as `tiler.export.foam_part.FoamPlan`.
     parts : int, optional
@@ -92,22 +105,38 @@ def write_foam_prisms(
     order = np.argsort(keys, kind="stable")
     whole = replace(mesh, outer=mesh.outer[order], outer_cell=mesh.outer_cell[order])
     keys = keys[order]
+    zones = _zones_of(whole, order, by_zone=by_zone)
+    zone_keys = np.empty(0, np.int64) if zones is None else np.unique(zones[zones >= 0])
     n_corners = int((mesh.inner != NO_CORNER).sum() + (mesh.outer != NO_CORNER).sum())
     label = 32 if max(n_corners, len(mesh.points), len(mesh.cells)) <= LABEL_LIMIT else 64
     if parts is None:
-        alone = _Part(0, whole, keys, {}, np.empty((0, 4), np.int64), np.empty(0, np.int64), {})
-        return [_write_part(folder / POLY_MESH, alone, np.unique(keys), heights, label)]
+        alone = _Part(0, whole, keys, zones, {}, np.empty((0, 4), np.int64), np.empty(0, np.int64), {})
+        return [_write_part(folder / POLY_MESH, alone, np.unique(keys), zone_keys, heights, label)]
     part = _divide(whole, parts)
     return [
         _write_part(
             folder / f"processor{number}" / POLY_MESH,
-            _take_part(whole, keys, part, number),
+            _take_part(whole, keys, zones, part, number),
             np.unique(keys),
+            zone_keys,
             heights,
             label,
         )
         for number in range(parts)
     ]
+
+
+def _zones_of(mesh: PrismMesh, order: Ints, *, by_zone: bool) -> Ints | None:
+    """Give the face zones, as `_Part` has them; `order` is that in which the boundary stands."""
+    ground = np.sort(mesh.between[is_ground(mesh.between_marker)], axis=1)
+    if not by_zone and not len(ground):
+        return None
+    inner, n = group_rows(np.concatenate((np.sort(mesh.inner[:, :3], axis=1), ground)))
+    known = np.zeros(n, np.bool_)
+    known[inner[len(mesh.inner) :]] = True
+    inside = np.where(known[inner[: len(mesh.inner)]] & (mesh.inner[:, 3] == NO_CORNER), GROUND_ZONE, -1)
+    houses = by_zone & is_house(mesh.marker, mesh.building)
+    return np.concatenate((inside, np.where(houses, mesh.building, -1)[order]))
 
 
 def _divide(mesh: PrismMesh, n_parts: int) -> Ints:
@@ -123,7 +152,7 @@ def _divide(mesh: PrismMesh, n_parts: int) -> Ints:
     return part
 
 
-def _take_part(mesh: PrismMesh, keys: Ints, part: Ints, number: int) -> _Part:
+def _take_part(mesh: PrismMesh, keys: Ints, zones: Ints | None, part: Ints, number: int) -> _Part:
     """Take the cells of a part, and number points, cells and faces anew, in their order."""
     cells = np.flatnonzero(part == number)
     place = np.empty(len(part), np.int64)
@@ -156,11 +185,13 @@ def _take_part(mesh: PrismMesh, keys: Ints, part: Ints, number: int) -> _Part:
         outer=local(mesh.outer[mine]),
         outer_cell=place[mesh.outer_cell[mine]],
         leaves=None if mesh.leaves is None else mesh.leaves[cells],
+        region=None if mesh.region is None else mesh.region[cells],
     )
     return _Part(
         number,
         own,
         keys[mine],
+        None if zones is None else zones[np.concatenate((inside, len(mesh.inner) + mine))],
         dict(zip(beyond.tolist(), count.tolist(), strict=True)),
         local(np.where(turned[:, None], back, rows)),
         place[np.where(turned, mesh.neighbour[across], mesh.owner[across])],
@@ -173,7 +204,9 @@ def _take_part(mesh: PrismMesh, keys: Ints, part: Ints, number: int) -> _Part:
     )
 
 
-def _write_part(place: Path, part: _Part, patch_of_all: Ints, heights: Path | None, label: int) -> PartCounts:
+def _write_part(
+    place: Path, part: _Part, patch_of_all: Ints, zone_of_all: Ints, heights: Path | None, label: int
+) -> PartCounts:
     """Write the polyMesh of a part, which has the patches of the whole mesh."""
     place.mkdir(parents=True)
     mesh = part.mesh
@@ -212,23 +245,37 @@ def _write_part(place: Path, part: _Part, patch_of_all: Ints, heights: Path | No
         for other, cell in zip(part.others, np.split(part.across_cell, ends), strict=False):
             height[cell].tofile(heights / f"{part.number}-{other}")
     own = heights / f"{part.number}" if heights is not None else None
-    leaves = _write_leaves(place / "cellZones", mesh, own) if mesh.leaves is not None else {}
+    if part.zones is not None:
+        keys = np.concatenate((part.zones, np.full(len(part.across), -1)))
+        _write_zones(place / "faceZones", keys, zone_of_all, face_zone_name)
+    leaves = _write_volumes(place / "cellZones", mesh, own)
     return PartCounts(
         len(mesh.cells), len(mesh.points), len(faces), len(mesh.inner), counts, lowest, highest, near, leaves
     )
 
 
-def _write_leaves(path: Path, mesh: PrismMesh, heights: Path | None) -> dict[str, int]:
-    """Write the zones of cells between leaves, and their density beside the heights; gives the cells of each."""
-    density = np.zeros(0, np.float32) if mesh.leaves is None else mesh.leaves
-    keys = np.where(density > 0, leaf_key(density), -1)
+def _write_zones(path: Path, keys: Ints, known: Ints, name_of: Callable[[int], str]) -> None:
+    count = [int((keys == key).sum()) for key in known.tolist()]
+    sets = FacetSets(known, {0: dict(enumerate(count))})
+    with ZonesFile(path, sets, [0], name_of) as file:
+        file.write(0, keys, np.arange(len(keys)))
+
+
+def _write_volumes(path: Path, mesh: PrismMesh, heights: Path | None) -> dict[str, int]:
+    """Write the zones of regions and leaves, and the density beside the heights; gives cells between leaves."""
+    if mesh.leaves is None and mesh.region is None:
+        return {}
+    keys = np.full(len(mesh.cells), -1) if mesh.region is None else mesh.region.astype(np.int64)
+    if mesh.leaves is not None:
+        keys = np.where(mesh.leaves > 0, leaf_key(mesh.leaves), keys)
     present, count = np.unique(keys[keys >= 0], return_counts=True)
     sets = FacetSets(present, {0: dict(enumerate(count.tolist()))})
     with ZonesFile(path, add_all_leaves(sets), [0], cell_zone_name) as file:
         write_volumes(file, 0, keys, np.arange(len(keys)))
-    if heights is not None:
-        density.astype("<f8").tofile(leaves_beside(heights))
-    return dict(zip(map(cell_zone_name, present.tolist()), count.tolist(), strict=True))
+    if heights is not None and mesh.leaves is not None:
+        mesh.leaves.astype("<f8").tofile(leaves_beside(heights))
+    leafy = present >= FIRST_LEAVES
+    return dict(zip(map(cell_zone_name, present[leafy].tolist()), count[leafy].tolist(), strict=True))
 
 
 def _write_faces(path: Path, faces: NDArray[np.int64], label: int) -> None:

@@ -25,6 +25,7 @@ from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
+from tiler.store.run_folder import LEAVES
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
 # CGNS's types of elements by corners: TRI_3 and QUAD_4, TETRA_4, PYRA_5 and PENTA_6.
@@ -38,6 +39,7 @@ INT32_LIMIT = 2**31 - 1
 NAME_BYTES, TYPE_BYTES = 33, 3  # of attributes and the strings at the root, their last byte zero
 UNITS = ("Null", "Meter", "Null", "Null", "Null")  # mass, length, time, temperature, angle: 32 characters each
 LENGTH = (0, 1, 0, 0, 0)  # its exponents in these
+LEAF_DATA = f"Leaves/{LEAVES}/ data"
 TYPES = {"i4": "I4", "i8": "I8", "f4": "R4", "f8": "R8", "i1": "C1"}
 
 
@@ -49,6 +51,7 @@ class _Survey:
     cells: dict[int, int]  # by corners
     facets: dict[int, dict[int, int]]
     ground: tuple[str, ...]  # names of its patches
+    leaves: bool  # whether cells have a leaf area density
 
     @property
     def n_cells(self) -> int:
@@ -108,6 +111,7 @@ def export_cgns(
     with replacing(output) as part, disk_errors(output):
         if cells is not None:
             mesh = read_prisms(pieces, cells, prism_layers)
+            _refuse_regions(mesh.region)
             _write_prisms(part, mesh, crs, by_building=buildings is not None)
         else:
             write_cgns(part, pieces, crs=crs, buildings=buildings)
@@ -123,7 +127,9 @@ def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -
             facets.setdefault(key, {})[width] = corners[rows]
     counts = {key: {width: len(rows) for width, rows in facets[key].items()} for key in sorted(facets)}
     kinds = mesh.by_width()
-    survey = _Survey(len(mesh.points), {width: len(rows) for width, rows in kinds}, counts, mesh.ground)
+    survey = _Survey(
+        len(mesh.points), {width: len(rows) for width, rows in kinds}, counts, mesh.ground, mesh.leaves is not None
+    )
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
         zone = _write_tree(file, survey, crs)
         for axis, name in enumerate("XYZ"):
@@ -131,6 +137,8 @@ def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -
         for width, rows in kinds:
             data = zone[f"{survey.sections[width]}/ElementConnectivity/ data"]
             data[:] = mesh.cells[rows, :width].ravel() + 1
+        if mesh.leaves is not None:
+            zone[LEAF_DATA][:] = mesh.leaves[np.concatenate([rows for _, rows in kinds])]
         for key, parts in facets.items():
             for width, rows in parts.items():
                 zone[f"{_section(patch_of_key(key, mesh.ground), width)}/ElementConnectivity/ data"][:] = (
@@ -170,6 +178,9 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
                     data[start : start + len(rows)] = piece.points[rows, axis]
             found = patch_keys(piece.marker, piece.building, by_building=buildings is not None)
             patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
+            if piece.leaves is not None:
+                first = seen[0] // piece.cells.shape[1]
+                zone[LEAF_DATA][first : first + len(piece.cells)] = piece.leaves
             for key, corners in [(0, piece.cells), *patches]:
                 nodes = piece.ids[corners].ravel() + 1
                 # Not kept open: each open data set that was written has a buffer of 64 kB.
@@ -178,14 +189,11 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
 
 
 def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
-    n_cells, facets = 0, dict[int, int]()
+    n_cells, facets, leaves = 0, dict[int, int](), False
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
-        if piece.region is not None and piece.region.any():
-            raise ConfigError(
-                "cgns: the mesh has soil or cells in buildings, and the file holds one zone, of air; use "
-                "openfoam, msh or xdmf"
-            )
+        _refuse_regions(piece.region)
+        leaves = piece.leaves is not None
         n_cells += len(piece.cells)
         keys, counts = np.unique(
             patch_keys(piece.marker, piece.building, by_building=by_building), return_counts=True
@@ -193,8 +201,16 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
         for key, n in zip(keys.tolist(), counts.tolist(), strict=True):
             facets[key] = facets.get(key, 0) + n
     return _Survey(
-        pieces.n_points, {4: n_cells}, {key: {3: n} for key, n in sorted(facets.items())}, pieces.ground
+        pieces.n_points, {4: n_cells}, {key: {3: n} for key, n in sorted(facets.items())}, pieces.ground, leaves
     )
+
+
+def _refuse_regions(region: NDArray[np.int8] | None) -> None:
+    if region is not None and region.any():
+        raise ConfigError(
+            "cgns: the mesh has soil or cells in buildings, and the file holds one zone, of air; use "
+            "openfoam, msh or xdmf"
+        )
 
 
 def _section(patch: Patch, width: int) -> str:
@@ -228,6 +244,11 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
     for width, n in survey.cells.items():
         _write_section(zone, survey.sections[width], (SOLIDS[width], width), first, n, kind)
         first += n
+    if survey.leaves:
+        solution = _node(zone, "Leaves", "FlowSolution_t")
+        _node(solution, "GridLocation", "GridLocation_t", "CellCenter")
+        density = _array(solution, LEAVES, survey.n_cells, "f4")
+        _node(density, "DimensionalExponents", "DimensionalExponents_t", np.array(-np.array(LENGTH), "<f4"))
     conditions = _node(zone, "ZoneBC", "ZoneBC_t") if patches else None
     for key, patch in patches.items():
         begin = first

@@ -21,6 +21,7 @@ from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
+from tiler.store.run_folder import LEAVES
 
 # No marker has one of these numbers: some programs know groups by number alone.
 VOLUMES = {Region.AIR: 10, Region.SOIL: 20, Region.BUILDING: 21}
@@ -32,6 +33,7 @@ NOT_OF_SOIL = (Marker.WALL, Marker.ROOF, Marker.TOP)
 OF_BUILDING = (Marker.WALL, Marker.ROOF, Marker.MISSING, Marker.FOUNDATION)
 TRIANGLE, QUADRILATERAL, TETRAHEDRON = 2, 3, 4  # Gmsh's types of elements
 SOLIDS = {4: TETRAHEDRON, 5: 7, 6: 6}  # those of cells, by their corners: pyramids and prisms, too
+LEAF_ROW = np.dtype([("tag", "<i4"), ("density", "<f8")])
 TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
 
 _Box = NDArray[np.float64]
@@ -47,6 +49,7 @@ class _Survey:
     facets: dict[int, int]
     boxes: dict[int, _Box]
     ground: tuple[str, ...]
+    leaves: bool  # whether cells have a leaf area density
 
     @property
     def n_elements(self) -> int:
@@ -115,6 +118,7 @@ def export_msh(
         _write_entities(file, survey)
         nodes = _begin_nodes(file, survey.n_points)
         elements = _begin_elements(file, survey)
+        leaves = _begin_leaves(file, survey.n_elements) if survey.leaves else 0
         seen = dict.fromkeys(elements, 0)
         for k in range(len(pieces.names)):
             piece = pieces.read(k)
@@ -122,16 +126,24 @@ def export_msh(
                 file.seek(nodes + 24 * start)
                 file.write(np.ascontiguousarray(piece.points[rows], "<f8").data)
             found = patch_keys(piece.marker, piece.building, by_building=by_building)
-            patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
+            none = np.zeros(len(piece.facets), np.float32)
+            patches = [(key, piece.facets[rows], none[rows]) for key, rows in facets_by_key(survey.facets, found)]
             volumes = _groups(piece)
-            patches += [(group, piece.cells[volumes == group]) for group in survey.cells]
-            for group, rows_of_group in patches:
+            density = np.zeros(len(piece.cells), np.float32) if piece.leaves is None else piece.leaves
+            patches += [
+                (group, piece.cells[volumes == group], density[volumes == group]) for group in survey.cells
+            ]
+            for group, rows_of_group, lad in patches:
                 place, first = elements[group]
-                file.seek(place + 8 * (1 + rows_of_group.shape[1]) * seen[group])
+                place += 8 * (1 + rows_of_group.shape[1]) * seen[group]
                 for some in slices(len(rows_of_group)):
                     corners = piece.ids[rows_of_group[some]]
                     tags = first + seen[group] + np.arange(len(corners))
-                    file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
+                    file.seek(place)
+                    place += file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
+                    if piece.leaves is not None:
+                        file.seek(leaves + LEAF_ROW.itemsize * int(tags[0] - 1))
+                        file.write(_leaf_rows(tags, lad[some]))
                     seen[group] += len(corners)
 
 
@@ -139,7 +151,7 @@ def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: b
     """Write prisms and others; a surface may have two blocks of elements, and the volume one a kind of cells."""
     blocks: list[tuple[int, int, Ints]] = []
     counts: dict[int, int] = {}
-    boxes: dict[int, _Box] = {AIR: _grown(_no_box(), mesh.points)}
+    boxes: dict[int, _Box] = {}
     for width, kind in ((3, TRIANGLE), (4, QUADRILATERAL)):
         corners, marker, building = mesh.facets(width)
         keys = patch_keys(marker, building, by_building=by_building)
@@ -147,9 +159,16 @@ def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: b
             blocks.append((key, kind, corners[rows]))
             counts[key] = counts.get(key, 0) + len(rows)
             boxes[key] = _grown(boxes.get(key, _no_box()), mesh.points[corners[rows].ravel()])
-    blocks += [(AIR, SOLIDS[width], mesh.cells[rows, :width]) for width, rows in mesh.by_width()]
-    survey = _Survey(len(mesh.points), {AIR: len(mesh.cells)}, dict(sorted(counts.items())), boxes, mesh.ground)
-    numbers = survey.numbers | {AIR: AIR}
+    volumes, cells = _groups(mesh), dict[int, int]()
+    for width, of_width in mesh.by_width():
+        for group in np.unique(volumes[of_width]).tolist():
+            corners = mesh.cells[of_width[volumes[of_width] == group], :width]
+            blocks.append((group, SOLIDS[width], corners))
+            cells[group] = cells.get(group, 0) + len(corners)
+            boxes[group] = _grown(boxes.get(group, _no_box()), mesh.points[corners.ravel()])
+    cells, counts = dict(sorted(cells.items())), dict(sorted(counts.items()))
+    survey = _Survey(len(mesh.points), cells, counts, boxes, mesh.ground, mesh.leaves is not None)
+    numbers = survey.numbers | {group: group for group in cells}
     with replacing(output) as part, part.open("wb") as file:
         _write_head(file, origin)
         _write_names(file, survey)
@@ -167,6 +186,14 @@ def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: b
             file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
             tag += len(corners)
         file.write(b"\n$EndElements\n")
+        if mesh.leaves is not None:
+            cells_first = n - len(mesh.cells)
+            order = [
+                rows[volumes[rows] == g] for _, rows in mesh.by_width() for g in np.unique(volumes[rows]).tolist()
+            ]
+            lad = np.concatenate((np.zeros(cells_first, np.float32), mesh.leaves[np.concatenate(order)]))
+            file.seek(_begin_leaves(file, n))
+            file.write(_leaf_rows(np.arange(1, n + 1), lad))
 
 
 def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
@@ -217,8 +244,10 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
     cells: dict[int, int] = {}
     facets: dict[int, int] = {}
     boxes: dict[int, _Box] = {}
+    leaves = False
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
+        leaves = piece.leaves is not None
         volumes = _groups(piece)
         found = patch_keys(piece.marker, piece.building, by_building=by_building)
         parts = [(cells, group, piece.cells[volumes == group]) for group in np.unique(volumes).tolist()]
@@ -229,12 +258,11 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
             used = np.zeros(len(piece.points), np.bool_)
             used[corners] = True
             boxes[group] = _grown(boxes.get(group, _no_box()), piece.points[used])
-    return _Survey(
-        pieces.n_points, dict(sorted(cells.items())), dict(sorted(facets.items())), boxes, pieces.ground
-    )
+    cells, facets = dict(sorted(cells.items())), dict(sorted(facets.items()))
+    return _Survey(pieces.n_points, cells, facets, boxes, pieces.ground, leaves)
 
 
-def _groups(piece: MeshPiece) -> NDArray[np.int64]:
+def _groups(piece: MeshPiece | PrismMesh) -> NDArray[np.int64]:
     """Give the number of each cell's group."""
     region = np.zeros(len(piece.cells), np.int8) if piece.region is None else piece.region
     return np.array([VOLUMES[value] for value in Region], np.int64)[region]
@@ -303,6 +331,22 @@ def _begin_elements(file: BinaryIO, survey: _Survey) -> dict[int, tuple[int, int
         tag += count
     file.write(b"\n$EndElements\n")
     return places
+
+
+def _begin_leaves(file: BinaryIO, n: int) -> int:
+    """Write the section of the leaf area density of all elements but its rows; returns where they begin."""
+    file.seek(0, 2)
+    file.write(f'$ElementData\n1\n"{LEAVES}"\n1\n0.0\n3\n0\n1\n{n}\n'.encode())
+    start = file.tell()
+    file.seek(LEAF_ROW.itemsize * n, 1)
+    file.write(b"\n$EndElementData\n")
+    return start
+
+
+def _leaf_rows(tags: Ints, density: NDArray[np.float32]) -> bytes:
+    rows = np.empty(len(tags), LEAF_ROW)
+    rows["tag"], rows["density"] = tags, density
+    return rows.tobytes()
 
 
 def _packed(kind: str, numbers: Iterable[Any]) -> bytes:

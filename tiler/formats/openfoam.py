@@ -78,7 +78,7 @@ def export_openfoam(
     Raises
     ------
     ConfigError
-        If there are too few columns for so many parts, or buildings of prisms are to be zones, no side for the
+        If there are too few columns for so many parts, no side for the
         wind to come from, soil or cells in buildings where it should blow, or a mesh of several parts that share
         no face.
     InputError
@@ -89,8 +89,6 @@ def export_openfoam(
     if case is None and wind:
         raise ConfigError(f"--{min(wind).replace('_', '-')}: is for --case wind; give that too")
     blowing = make_wind(wind)
-    if cells is not None and buildings == "zones":
-        raise ConfigError(f"--buildings zones: not with --cells {cells}; leave one out, or take patches")
     pieces = open_pieces(source)
     solids = Region.BUILDING in pieces.files.regions
     if case is not None and pieces.files.depth:
@@ -110,8 +108,8 @@ def export_openfoam(
         heights = None if case is None else Path(name)
         if cells is not None:
             prisms = read_prisms(pieces, cells, prism_layers, polyhedra=True)
-            by_building = buildings == "patches"
-            counts = write_foam_prisms(folder, prisms, by_building=by_building, heights=heights, parts=parts)
+            kinds = {"by_building": buildings == "patches", "by_zone": buildings == "zones"}
+            counts = write_foam_prisms(folder, prisms, **kinds, heights=heights, parts=parts)
         else:
             counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings, heights=heights)
         notes = []

@@ -14,7 +14,7 @@ from tiler.mesh_files.run_files import RunFiles
 from tiler.mesh_files.transitions import NO_CORNER
 from tiler.mesh_files.vtk_files import stream_offsets
 from tiler.mesh_files.vtk_xml import Stream, stream_items, write_data_file
-from tiler.store.run_folder import LEAVES
+from tiler.store.run_folder import LEAVES, REGION
 
 # VTK's numbers of tetrahedra, pyramids and wedges, by corners: its measures of volume are positive in our order.
 TYPES = np.array([0, 0, 0, 0, 10, 14, 13], np.uint8)
@@ -45,6 +45,7 @@ def write_prisms(path: Path, mesh: PrismMesh, *, scalars: bool = False) -> None:
     number = np.dtype(np.int32 if len(mesh.points) < 2**31 else np.int64)
     tiles = [_stream(TILE, mesh.tile, mesh.tile.dtype)] if scalars else []
     tiles += [_stream(LEAVES, mesh.leaves, mesh.leaves.dtype)] if mesh.leaves is not None else []
+    tiles += [_stream(REGION, mesh.region, mesh.region.dtype)] if mesh.region is not None else []
     sections = {
         "Points": [_stream("Points", mesh.points, mesh.points.dtype, components=3)],
         "Cells": [

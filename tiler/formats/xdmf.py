@@ -141,6 +141,8 @@ def _write_prisms(path: Path, mesh: PrismMesh) -> Rows:
         cells = np.column_stack((MIXED[mesh.widths], cells))
         cells = cells[cells != NO_CORNER]
     sets: dict[str, NDArray[np.generic]] = {"points": mesh.points, "cells": cells}
+    if mesh.region is not None:
+        sets["region"] = mesh.region.astype(np.int32)
     if mesh.leaves is not None:
         sets[LEAVES] = mesh.leaves
     for name, width in (("", 3), ("side_", 4)):

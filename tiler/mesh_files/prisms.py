@@ -5,12 +5,14 @@ of such a mesh may be prisms. In other columns levels merge, and a hybrid mesh h
 tetrahedra elsewhere (`tiler.mesh_files.transitions`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import find_inside
 from pipeline.data.regions import Region
 from stitch.pieces.conformity import group_rows
 from stitch.pieces.face_mates import FACES
@@ -18,6 +20,7 @@ from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces
 from tiler.mesh_files.transitions import NO_CORNER, SIDES, find_cut_sides, halve_sides, split_prisms
 
 Ints = NDArray[np.int64]
+Number = TypeVar("Number", bound=np.generic)
 LAYERS = 10  # of prisms in a hybrid mesh, where nothing else is asked for
 # Faces of cells by their corners, counter-clockwise seen from outside; -1 stands for no fourth corner.
 ENDS = np.array([[0, 2, 1, NO_CORNER], [3, 4, 5, NO_CORNER]])
@@ -60,6 +63,12 @@ class PrismMesh:
     leaves : float32, (m,), or None
         Leaf area density of each cell (m2/m3), of a prism that of the middle one of its three tetrahedra; None
         without trees.
+    region : int8, (m,), or None
+        `pipeline.data.regions.Region` of each cell; None where all is air.
+    between : int64, (g, 3)
+        Facets between two regions, out of the first (`pipeline.data.mesh.INTERFACES`); these are among `inner`.
+    between_marker, between_building
+        Of each of them, as `marker` and `building`.
     """
 
     points: NDArray[np.float64]
@@ -74,6 +83,10 @@ class PrismMesh:
     building: Ints
     ground: tuple[str, ...] = ()
     leaves: NDArray[np.float32] | None = None
+    region: NDArray[np.int8] | None = None
+    between: Ints = field(default_factory=lambda: np.empty((0, 3), np.int64))
+    between_marker: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    between_building: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
     @property
     def widths(self) -> Ints:
@@ -97,15 +110,26 @@ class PrismMesh:
         return centres
 
     def facets(self, width: int) -> tuple[Ints, NDArray[np.int32], Ints]:
-        """Give the triangles (3) or quadrilaterals (4) of the boundary: corners, marker and building of each."""
+        """Give the triangles (3) or quadrilaterals (4) of the boundary: corners, marker and building of each.
+
+        Triangles between two regions are behind those of the boundary.
+        """
         chosen = (self.outer[:, 3] != NO_CORNER) == (width == 4)
-        return self.outer[chosen, :width], self.marker[chosen], self.building[chosen]
+        found = self.outer[chosen, :width], self.marker[chosen], self.building[chosen]
+        if width == 4:
+            return found
+        corners, marker, building = found
+        return (
+            np.concatenate((corners, self.between)),
+            np.concatenate((marker, self.between_marker)),
+            np.concatenate((building, self.between_building)),
+        )
 
 
 def read_prisms(
     pieces: MeshPieces, kind: str = "prism", layers: int | None = None, *, polyhedra: bool = False
 ) -> PrismMesh:
-    """Read the mesh of a run as prisms.
+    """Read the mesh of a run as prisms; soil and buildings stay tetrahedra.
 
     Parameters
     ----------
@@ -123,7 +147,8 @@ def read_prisms(
     Raises
     ------
     ConfigError
-        If buildings have cells, or there are less than one layer, or layers without a hybrid mesh.
+        If buildings or soil have cells and all are to be prisms, or there are less than one layer, or layers
+        without a hybrid mesh.
     InputError
         If some of its cells are no thirds of prisms, or a piece is damaged.
 
@@ -133,13 +158,14 @@ def read_prisms(
     """
     if layers is not None and (kind != "hybrid" or layers < 1):
         raise ConfigError(f"--prism-layers {layers}: is for --cells hybrid, and 1 or more")
-    if len(pieces.files.regions) > 1:
+    if len(pieces.files.regions) > 1 and kind == "prism":
         what = "in buildings" if Region.BUILDING in pieces.files.regions else "in soil"
         option = "--solids" if Region.BUILDING in pieces.files.regions else "--underground"
-        raise ConfigError(f"--cells {kind}: not with cells {what}; leave it out, or mesh without {option}")
+        raise ConfigError(f"--cells {kind}: not with cells {what}; take --cells hybrid, or mesh without {option}")
     points = np.empty((pieces.n_points, 3))
     cells, turned, facets, marker, building = [], [], [], [], []
     leaves: list[NDArray[np.float32]] = []
+    regions: list[NDArray[np.int8]] = []
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
         points[piece.ids] = piece.points
@@ -150,9 +176,14 @@ def read_prisms(
         marker.append(piece.marker)
         building.append(piece.building)
         leaves += [] if piece.leaves is None else [piece.leaves[first + (rows[:, 4] != NO_CORNER)]]
+        regions += [] if piece.region is None else [piece.region[first]]
     tile = np.repeat(np.arange(len(cells), dtype=np.int32), [len(part) for part in cells])
     prisms, triangles = np.concatenate(cells), np.concatenate(facets)
-    marks, houses, density = np.concatenate(marker), np.concatenate(building), _join(leaves)
+    marks, houses = np.concatenate(marker), np.concatenate(building)
+    density, region = _join(leaves), _join(regions)
+    inside = find_inside(marks, pieces.files.regions) if region is not None else np.zeros(len(marks), np.bool_)
+    between = triangles[inside], marks[inside], houses[inside]
+    triangles, marks, houses = triangles[~inside], marks[~inside], houses[~inside]
     if kind == "hybrid":
         second = np.concatenate(turned)
         cut = find_cut_sides(prisms, second, triangles, np.column_stack((marks, houses)))
@@ -160,6 +191,7 @@ def read_prisms(
         prisms, parent, middle = split_prisms(prisms, second, cut, len(points))
         points = np.concatenate((points, points[middle].mean(axis=1)))
         tile, density = tile[parent], None if density is None else density[parent]
+        region = None if region is None else region[parent]
     listed = list_faces(prisms)
     if kind == "hybrid" and polyhedra:
         listed = halve_sides(*listed, prisms, second, cut)
@@ -168,11 +200,13 @@ def read_prisms(
     if (np.append(marks, 0)[row] != marks[row[:, :1]]).any():
         raise InputError(f"{pieces.files.directory}: halves of a face have different markers; run again")
     first_half = row[:, 0]
-    return PrismMesh(points, prisms, tile, *faces, marks[first_half], houses[first_half], pieces.ground, density)
+    found = marks[first_half], houses[first_half]
+    mesh = PrismMesh(points, prisms, tile, *faces, *found, pieces.ground, density, region)
+    return replace(mesh, between=between[0], between_marker=between[1], between_building=between[2])
 
 
-def _join(leaves: list[NDArray[np.float32]]) -> NDArray[np.float32] | None:
-    return np.concatenate(leaves) if leaves else None
+def _join(parts: list[NDArray[Number]]) -> NDArray[Number] | None:
+    return np.concatenate(parts) if parts else None
 
 
 def combine_cells(cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
@@ -242,6 +276,8 @@ def _hybrid_of(piece: MeshPiece, layers: int) -> Combined:
     cells = piece.cells
     n = len(cells)
     prisms, whole = combine_cells(np.lib.stride_tricks.sliding_window_view(cells, 3, axis=0).swapaxes(1, 2))
+    if piece.region is not None:  # cells of one region stand together
+        whole &= (piece.region[:-2] == Region.AIR) & (piece.region[2:] == Region.AIR)
     # A cell stands on the one before it if that one's upper corners are its lower ones.
     stands = (np.sort(cells[1:, :3], axis=1) == np.sort(cells[:-1, 1:], axis=1)).all(axis=1)
     triangle = np.cumsum(np.concatenate(([0], ~stands)))

@@ -25,6 +25,7 @@ from tiler.words.plain_text import say_nothing
 
 SCHEMA = 1  # version of the JSON file's layout
 WORKERS = (1, 4, 16, 64)  # numbers of workers that times are given for, besides the one asked for
+COVERED = 2.2  # times as many cells at most with edges of land cover; measured: 1.1 to 2.1 (docs/land-cover.md)
 BUSIEST = 5  # tiles with the most cells that the JSON file lists
 UNITS = ((1e9, "billion"), (1e6, "million"), (1e3, "thousand"))
 WIDTH = 80  # characters, where the terminal is not narrower
@@ -128,6 +129,7 @@ def describe_plan(
             "points": _rounded(loads.cells.sum() / CELLS_A_POINT),
             "cells_of_largest_tile": _rounded(loads.cells.max(initial=0.0)),
         }
+        | ({"cells_with_land_cover": _rounded(COVERED * loads.cells.sum())} if config.land_cover else {})
         | ({"cells_by_level": {k: _rounded(n) for k, n in by_level.items()}} if by_level else {}),
         "tasks": {entry.stage: {"scope": entry.scope.value, "number": entry.number} for entry in forecast.tasks},
         "memory": {
@@ -191,6 +193,8 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
             f"({mesh['mesher']}, {mesh['mesh_size']:g} m); largest tile {_count(mesh['cells_of_largest_tile'])}",
         )
     )
+    if "cells_with_land_cover" in mesh:
+        rows.append(("", f"edges of land cover: up to {_count(mesh['cells_with_land_cover'])} cells"))
     if "cells_by_level" in mesh:
         parts = (f"{_count(n)} at {level}" for level, n in mesh["cells_by_level"].items())
         rows.append(("", f"in zones of detail: {', '.join(parts)}"))

@@ -160,8 +160,6 @@ def test_openfoam_has_faces_of_three_and_of_four_corners(
 def test_columns_whose_levels_merge_are_refused(small_run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tile .*: its cells are not all thirds of prisms.*--mesher layered"):
         export_run(small_run, tmp_path / "a.vtu", name="vtu", options={"cells": "prism"})
-    with pytest.raises(ConfigError, match=r"--buildings zones: not with --cells prism"):
-        export_run(small_run, tmp_path / "case", name="openfoam", options={"cells": "prism", "buildings": "zones"})
     with pytest.raises(ConfigError, match=r"--prism-layers 3: is for --cells hybrid"):
         export_run(small_run, tmp_path / "a.vtu", name="vtu", options={"cells": "prism", "prism_layers": 3})
     assert list(tmp_path.iterdir()) == []

@@ -11,6 +11,7 @@ import h5py
 import meshio
 import numpy as np
 import pytest
+import pyvista
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError
@@ -18,7 +19,7 @@ from pipeline.data.mesh import Marker
 from pipeline.data.regions import Region
 from stitch.pieces.conformity import compute_cell_volumes
 from tests.conftest import Once
-from tests.helpers.foam_reader import PolyMesh, read_poly_mesh, read_zones
+from tests.helpers.foam_reader import PolyMesh, read_boundary, read_labels, read_poly_mesh, read_zones
 from tests.helpers.hand_pieces import HandPieces
 from tests.helpers.patch_readers import open_edges, read_obj, surface_of
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam, run_program
@@ -27,14 +28,17 @@ from tests.helpers.vtk_writers import write_vtu
 from tests.tiler.export.conftest import Exported
 from tests.tiler.export.test_formats_msh import check_with_gmsh
 from tests.tiler.export.test_formats_openfoam import MESH, assert_in_order, volumes_of
+from tiler.check.export_proofs import check_export
 from tiler.cli.main import main
 from tiler.export.export import export_run, list_formats
+from tiler.export.foam_files import read_foam_faces
 from tiler.export.foam_patches import PATCHES
 from tiler.formats.openfoam import write_openfoam
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.vtk_files import read_vtu
 
 DEPTH = 20.0
+TYPES = {"tetra": pyvista.CellType.TETRA, "pyramid": pyvista.CellType.PYRAMID, "wedge": pyvista.CellType.WEDGE}
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +90,42 @@ def region_volumes(parts: list[MeshPiece]) -> dict[str, float]:
         for region in Region:
             sums[region.name.lower()] += float(volume[part.region == region].sum())
     return sums
+
+
+def test_hybrid_cells_have_prisms_in_the_air_and_a_zone_a_region(soil_run: Path, exported: Exported) -> None:
+    folder = exported(soil_run, "openfoam", "--cells", "hybrid", "--buildings", "zones") / MESH
+    assert check_export(soil_run, folder.parents[1]).ok
+    faces = read_foam_faces(folder / "faces")
+    owner, neighbour = (read_labels(folder / name) for name in ("owner", "neighbour"))
+    cells = read_cell_zones(folder / "cellZones")
+    region = np.full(sum(map(len, cells.values())), -1)
+    for value, name in enumerate(("air", "soil")):
+        region[cells[name]] = value
+    assert set(region.tolist()) == {0, 1}
+    sides = region[owner[: len(neighbour)]], region[neighbour]
+    zones = read_zones(folder / "faceZones")
+    assert np.array_equal(np.sort(zones["ground"]), np.flatnonzero(sides[0] != sides[1]))
+    assert not sides[0][zones["ground"]].any()
+    assert region[owner[(faces[:, 3] >= 0).nonzero()]].max() == 0  # no side of four corners in soil
+    boundary = read_boundary(folder / "boundary")
+    of_houses = [
+        np.arange(patch.start, patch.start + patch.n) for patch in map(boundary.get, ("walls", "roofs")) if patch
+    ]
+    assert np.array_equal(
+        np.sort(np.concatenate([rows for name, rows in zones.items() if name != "ground"])),
+        np.concatenate(of_houses),
+    )
+    grid = meshio.read(exported(soil_run, "msh", "--cells", "hybrid"))
+    groups = {number: name for name, (number, dimension) in grid.field_data.items() if dimension == 3}
+    found = dict.fromkeys(groups.values(), 0.0)
+    for kind, rows in grid.cells_dict.items():
+        if kind in ("tetra", "pyramid", "wedge"):
+            part = pyvista.UnstructuredGrid({TYPES[kind]: rows}, grid.points - grid.points[0])
+            volume = part.compute_cell_sizes(length=False, area=False)["Volume"]
+            for number, name in groups.items():
+                found[name] += volume[grid.cell_data_dict["gmsh:physical"][kind] == number].sum()
+    expected = region_volumes(parts_of(soil_run))
+    assert found == pytest.approx({name: expected[name] for name in groups.values()}, rel=1e-9)
 
 
 # OpenFOAM.

@@ -90,7 +90,11 @@ def country(n: int, size: float = 1000.0) -> Survey:
 
 def test_cells_points_disk_and_memory_are_as_a_run_has_them(city: Config, record: dict[str, Any]) -> None:
     forecast, counts = forecast_of(city), record["counts"]
-    plan = describe_plan(survey_inputs(city, ignore), None, forecast, city, None)
+    survey = survey_inputs(city, ignore)
+    plan = describe_plan(survey, None, forecast, city, None)
+    covered = describe_plan(survey, None, forecast, replace(city, land_cover=("cover.gpkg",)), None)
+    assert "cells_with_land_cover" not in plan["mesh"]
+    assert covered["mesh"]["cells_with_land_cover"] == pytest.approx(2.2 * plan["mesh"]["cells"], rel=0.1)
     assert forecast.loads.cells.sum() == pytest.approx(counts["cells"], rel=0.2)
     assert plan["mesh"]["points"] == pytest.approx(counts["points"], rel=0.3)
     assert forecast.loads.lidar_points.sum() == pytest.approx(counts["points read"], rel=0.02)
