@@ -31,9 +31,21 @@ try {
   seen.after = { names: await names(page), camera: await camera(page) };
   seen.children = await page.evaluate(() => window.citystitch.tiles.group.parent.children.filter((one) => one === window.citystitch.tiles.group).length);
   await page.screenshot({ path: `${folder}/after.png` });
+  await page.focus("#view");
+  await page.keyboard.press("s");
+  await page.mouse.click(350, 330);
+  await page.mouse.click(650, 370);
+  await page.waitForFunction(() => window.citystitch.section.ends);
+  await page.waitForTimeout(1000);
+  seen.section = { words: await page.textContent("#length"), pressed: await page.getAttribute("#section", "aria-pressed") };
+  await page.screenshot({ path: `${folder}/section.png` });
   await page.setViewportSize({ width: 390, height: 844 });
   await page.waitForTimeout(500);
   await page.screenshot({ path: `${folder}/phone.png` });
+  seen.overflow = await page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
+  await page.focus("#view");
+  await page.keyboard.press("Escape");
+  seen.section.left = await page.evaluate(() => window.citystitch.section.meshes.length);
 } catch (error) {
   seen.error = String(error);
 } finally {

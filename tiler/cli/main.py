@@ -551,6 +551,7 @@ def _kernels(_: argparse.Namespace) -> int:
 
 def _edit(options: argparse.Namespace) -> int:
     from tiler.editing.edit import city_at, edit_city, list_edits
+    from tiler.editing.uploads import Upload
 
     directory, more = options.directory, {"workers": options.workers, "say": say}
     if options.out and options.at is None:
@@ -567,7 +568,7 @@ def _edit(options: argparse.Namespace) -> int:
         return int(record["exit_code"])
     name, upload = options.replace or (options.remove or "", options.add)
     action = "replace" if options.replace else "remove" if options.remove is not None else "add"
-    upload = None if upload is None else Path(upload)
+    upload = None if upload is None else Upload(Path(upload), options.position)
     done = edit_city(directory, action, name, upload, date=options.date, base=options.base, **more)
     edit = done.edit
     say(

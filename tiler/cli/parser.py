@@ -541,12 +541,18 @@ def _add_edit(edit: argparse.ArgumentParser) -> None:
         "--replace",
         nargs=2,
         metavar=("ID", "FILE"),
-        help="replace a building by the footprint of a vector file",
+        help="replace a building by the footprint of a vector file, or the building of a CityJSON or GLB file",
     )
     what.add_argument("--remove", metavar="ID", help="remove a building")
-    what.add_argument("--add", type=Path, metavar="FILE", help="add the footprints of a vector file")
+    what.add_argument("--add", type=Path, metavar="FILE", help="add what such a file has")
     what.add_argument("--list", action="store_true", dest="as_list", help="print the edits so far")
     what.add_argument("--at", metavar="DATE", help="make the city of a day, YYYY-MM-DD, in --out")
+    edit.add_argument(
+        "--position",
+        type=_position,
+        metavar="X,Y,Z",
+        help="easting, northing and height (m) of the origin of a GLB file (default: what the file says)",
+    )
     edit.add_argument("--out", type=_on_disk, metavar="DIR", help="folder for the city of a day")
     edit.add_argument("--date", default="", help="day from which the edit applies, YYYY-MM-DD (default: today)")
     edit.add_argument(
@@ -820,6 +826,14 @@ def _add_texture(texture: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--tile-size", type=float, default=250.0, metavar="METRES", help="side of a tile (default: 250)")
     add("--overwrite", action="store_true", help="replace the folder if it exists")
+
+
+def _position(text: str) -> tuple[float, ...]:
+    """Take a place in space."""
+    found = tuple(map(float, text.split(",")))
+    if len(found) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r}: three numbers X,Y,Z expected")
+    return found
 
 
 def _on_disk(text: str) -> Path:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from tiler.editing.requests import (
     read_date,
 )
 from tiler.editing.staging import begin, commit, finish_interrupted, forget, link_folder
-from tiler.editing.uploads import read_upload
+from tiler.editing.uploads import Upload, read_upload
 from tiler.engine.executor import Executor
 from tiler.engine.schedule import StoppedError
 from tiler.mesh_files.run_files import find_files
@@ -26,10 +27,12 @@ from tiler.objects.places import refuse_bucket
 from tiler.store.atomic import replacing_folder
 from tiler.store.edit_journal import Box, Edit, edit_path, read_journal, write_edit
 from tiler.store.folder_lock import is_held, only_run
-from tiler.store.out_folder import CONFIG, RUN_RECORD
+from tiler.store.out_folder import CITY_MODEL, CONFIG, FULL_CITY_MODEL, RUN_RECORD
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.audit import read_sealed_record
 from tiler.workflow.run import run
+
+CITY_FILES = CITY_MODEL, FULL_CITY_MODEL
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def edit_city(
     directory: Path,
     action: str,
     name: str = "",
-    upload: Path | None = None,
+    upload: Upload | None = None,
     *,
     date: str = "",
     base: int | None = None,
@@ -102,8 +105,8 @@ def edit_city(
         ``"replace"``, ``"remove"`` or ``"add"``.
     name : str
         Id of the building that is replaced or removed.
-    upload : Path, optional
-        Vector file of the footprint, or footprints, that come.
+    upload : Upload, optional
+        The footprints that come.
     date : str
         Day from which on the edit holds, YYYY-MM-DD; today by default.
     base : int, optional
@@ -129,7 +132,7 @@ def edit_city(
     """
     with held_city(directory, workers, say) as city:
         found = None if upload is None else read_upload(upload, city.config, crs=city.crs, bounds=city.bounds)
-        asked = Asked(action, name, found, "" if upload is None else upload.name, date, base)
+        asked = Asked(action, name, found, "" if upload is None else upload.path.name, date, base)
         (outcome,) = edit_together(city, [asked], say=say)
     if isinstance(outcome, CityError):
         raise outcome
@@ -141,6 +144,7 @@ def edit_together(
     asked: Sequence[Asked],
     *,
     executor: Executor | None = None,
+    city_files: bool = True,
     say: Callable[[str], None] = say_nothing,
 ) -> list[Outcome | CityError]:
     """Do edits in their order, and mesh what they touch in one transaction; the caller holds the folder.
@@ -153,6 +157,8 @@ def edit_together(
         Edits that wait.
     executor : Executor, optional
         Runs the tasks; by default that of the city's parameters.
+    city_files : bool
+        Whether the files of the city models are written too; else they are gone until `write_city_files`.
     say
         As for `edit_city`.
 
@@ -177,10 +183,11 @@ def edit_together(
     if not edits:
         return [one for one in found if isinstance(one, CityError)]
     try:
-        done = {outcome.edit: outcome for outcome in _mesh(city, edits, executor, say)}
+        done = {outcome.edit: outcome for outcome in _mesh(city, edits, executor, city_files, say)}
     except CityError as error:
         if len(edits) > 1 and not isinstance(error, OutputError | StoppedError):
-            return [edit_together(city, [one], executor=executor, say=say)[0] for one in asked]
+            alone = partial(edit_together, executor=executor, city_files=city_files, say=say)
+            return [alone(city, [one])[0] for one in asked]
         return [error if isinstance(one, Edit) else one for one in found]
     return [done[one] if isinstance(one, Edit) else one for one in found]
 
@@ -189,6 +196,7 @@ def _mesh(
     city: City,
     edits: Sequence[Edit],
     executor: Executor | None,
+    city_files: bool,
     say: Callable[[str], None],
 ) -> list[Outcome]:
     """Mesh a city with further edits in its second folder, and commit it; CityError if that cannot be."""
@@ -197,7 +205,9 @@ def _mesh(
         work = begin(city.directory)
         for edit in edits:
             write_edit(work, edit)
-        made = run(city.config, within=work, executor=executor)
+        for name in () if city_files else CITY_FILES:
+            (work / name).unlink(missing_ok=True)
+        made = run(city.config, within=work, executor=executor, city_files=city_files)
         if lost := sorted(made["missing"].keys() - record["missing"].keys()):
             names = ", ".join(name for edit in edits for name in edit.ids)
             raise InputError(
@@ -210,6 +220,17 @@ def _mesh(
             say(f"roof points in the cloud give the height, not the upload: {names}")
         files = commit(city.directory)
         return [Outcome(edit, made, files, some) for edit, some in zip(edits, unused, strict=True)]
+    finally:
+        forget(city.directory)
+
+
+def write_city_files(city: City, executor: Executor | None = None) -> None:
+    """Write the files of the city models that edits have left out, all or none; CityError if they cannot be."""
+    if all((city.directory / name).exists() for name in CITY_FILES):
+        return
+    try:
+        run(city.config, within=begin(city.directory), executor=executor)
+        commit(city.directory)
     finally:
         forget(city.directory)
 

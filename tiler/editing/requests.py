@@ -123,7 +123,9 @@ def make_edit(asked: Asked, *, buildings: Mapping[str, Box], journal: Sequence[E
     date = read_date(asked.date)
     last = journal[-1].number if journal else 0
     if base is not None and not 0 <= base <= last:
-        raise ConfigError(f"--base {base}: the last edit is number {last}; citystitch edit DIR --list tells all")
+        raise ConfigError(
+            f"base {base}: the last edit is number {last}; give one up to it, the list of edits tells all"
+        )
     if action == "replace" and upload is not None:
         upload = replace(upload, ids=np.full(len(upload.ids), name))
     outlines, boxes = ((), ()) if upload is None else as_outlines(upload)
@@ -162,6 +164,6 @@ def _refuse_conflicts(ids: set[str], journal: Sequence[Edit], date: str, base: i
         told += f", {edit.source})" if edit.source else ")"
         if later:
             last = journal[-1].number
-            raise ConflictError(f"{told} came after state {base}; look at it, then give --base {last}", later)
+            raise ConflictError(f"{told} came after state {base}; look at it, then give {last} as base", later)
         if date < edit.date:
             raise ConfigError(f"{told} is later than {date}; give a date from {edit.date} on")

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from tiler.store.atomic import disk_errors, replacing
@@ -90,6 +91,8 @@ def _move(directory: Path) -> None:
                 part.write_bytes(seal(json.dumps(record, indent=1).encode() + b"\n"))
         for name in listed["remove"]:
             (directory / name).unlink(missing_ok=True)
+            with suppress(OSError):  # of a stage that has no result any more
+                (directory / name).parent.rmdir()
         for name in sorted(listed["move"], key=RUN_RECORD.__eq__):  # the record last
             if (work / name).exists():
                 (directory / name).parent.mkdir(parents=True, exist_ok=True)

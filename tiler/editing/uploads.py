@@ -2,21 +2,26 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyproj
 import shapely
+from numpy.typing import NDArray
 
 from pipeline.data.citymodel import Footprints, take_footprints
 from pipeline.data.errors import InputError
+from pipeline.data.roofs import take_roofs
 from tiler.cityinput.faces import ModelBuilding
-from tiler.cityinput.rows import make_rows, mean_roofs
+from tiler.cityinput.rows import ModelRows, make_rows
 from tiler.cityinput.sources import frame_of, read_model_header, scan_model
 from tiler.config.config import Config
+from tiler.editing.glb_uploads import MAGIC, read_glb
 from tiler.footprints.footprint_index import FootprintRows, join_footprints, scan_footprints
 from tiler.footprints.footprint_source import open_source
 from tiler.georeference.crs import parse_crs, same_crs
+from tiler.georeference.frame import Frame
 from tiler.objects.places import is_missing
 from tiler.store.edit_journal import Box, Outline
 from tiler.vectors.layers import describe_layer
@@ -26,17 +31,28 @@ REFUSED = {
     *("footprint-unreadable", "footprint-not-finite", "footprint-not-polygon", "footprint-too-many-vertices"),
     *("footprint-height-missing", "footprint-roof-unread", "model-fault", "model-without-place"),
 }
+SAMPLES = 64  # along each side of the box of a building, where the heights of its roof are averaged
+EAST_NORTH = Frame((0, 1.0), (1, 1.0))
 HEAD = 2**20  # bytes of a file within which it says that it is CityJSON
 
 
-def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footprints:
+@dataclass(frozen=True)
+class Upload:
+    """A file that is uploaded; of GLB also where its origin lies, see `read_glb`."""
+
+    path: Path
+    position: Sequence[float] | None = None
+
+
+def read_upload(upload: Upload, config: Config, *, crs: str, bounds: Box) -> Footprints:
     """Read the footprints of an uploaded file.
 
     Parameters
     ----------
-    path : Path
+    upload : Upload
         Any vector file that `citystitch run` takes as footprints; ids, heights and roofs from the same attributes.
-        Or CityJSON, or a sequence of it: outlines, and mean heights of roofs above the lowest place of each.
+        Or CityJSON, or a sequence of it: outlines, and mean heights of roofs above the lowest place of each; or
+        one building as GLB.
     config : Config
         Parameters of the run that is edited.
     crs : str
@@ -54,9 +70,15 @@ def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footpri
     InputError
         If the file cannot be read, or a feature is no valid polygon or lies outside the region.
     """
+    path, position = upload.path, upload.position
     if is_missing(path):
         raise InputError(f"{path}: no such file; check the path of the upload")
-    if _is_cityjson(path):
+    start = _read_start(path)
+    if start.startswith(MAGIC):
+        return _check(path, _take_models(path, [read_glb(path, position)], EAST_NORTH), bounds)
+    if position is not None:
+        raise InputError(f"{path}: is no GLB file, and other files say where they stand; leave the position out")
+    if start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"{" and b'"CityJSON' in start:
         return _check(path, _read_model(path, crs), bounds)
     layer = describe_layer(path)
     # An upload may say less than the file of the city: what has no height takes that of the points.
@@ -83,21 +105,23 @@ def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footpri
     return _check(path, join_footprints(rows, bounds), bounds)
 
 
-def _is_cityjson(path: Path) -> bool:
+def _read_start(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            start = file.read(HEAD)
+            return file.read(HEAD)
     except OSError:  # a folder, say: the reader of vector files tells
-        return False
-    return start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"{" and b'"CityJSON' in start
+        return b""
 
 
 def _read_model(path: Path, crs: str) -> Footprints:
     """Read the buildings of CityJSON; one without a CRS is in that of the region."""
     header = read_model_header(path)
     is_other = header.crs is not None and not same_crs(header.crs, parse_crs(crs))
-    frame = frame_of(header, crs if is_other else "")
     buildings = [one for one in scan_model(path) if isinstance(one, ModelBuilding)]
+    return _take_models(path, buildings, frame_of(header, crs if is_other else ""))
+
+
+def _take_models(path: Path, buildings: Sequence[ModelBuilding], frame: Frame) -> Footprints:
     rows, notes = make_rows(buildings, frame, "auto", Counter())
     for note in notes:
         if note.kind in REFUSED:
@@ -108,7 +132,29 @@ def _read_model(path: Path, crs: str) -> Footprints:
             raise InputError(f"{path}: {name} stands in {len(some)} places; make a building of each")
     polygons = np.array([shapely.force_2d(some[0]) for some in parts], np.object_)
     order = np.argsort(rows.ids, kind="stable")
-    return take_footprints(Footprints(polygons, rows.ids, mean_roofs(rows)), order)
+    return take_footprints(Footprints(polygons, rows.ids, _mean_tops(rows)), order)
+
+
+def _mean_tops(rows: ModelRows) -> NDArray[np.float64]:
+    """Give the mean height of each building's highest surfaces above its lowest place (m).
+
+    Floors below count as little as they are seen from above. Where there is no surface it is the height that an
+    attribute gives, NaN without one.
+    """
+    found = rows.given_height.copy()
+    for k in np.flatnonzero(np.diff(rows.start)).tolist():
+        own = slice(rows.start[k], rows.start[k + 1])
+        xmin, ymin, xmax, ymax = shapely.bounds(rows.outlines[k]).tolist()
+        steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
+        x, y = (axis.ravel() for axis in np.meshgrid(xmin + steps * (xmax - xmin), ymin + steps * (ymax - ymin)))
+        point, surface = shapely.STRtree(rows.surfaces[own]).query(shapely.points(x, y), predicate="intersects")
+        roofs = take_roofs(rows.roofs, np.arange(own.start, own.stop)[surface])
+        away = np.column_stack((x, y))[point] - roofs.origin
+        top = np.full(len(x), -np.inf)
+        np.maximum.at(top, point, roofs.plane[:, 2] + (roofs.plane[:, :2] * away).sum(axis=1))
+        if np.isfinite(top).any():
+            found[k] = top[np.isfinite(top)].mean() - rows.base[k]
+    return found
 
 
 def _check(path: Path, footprints: Footprints, bounds: Box) -> Footprints:

@@ -3,7 +3,7 @@
 import base64
 import html
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
@@ -335,7 +335,15 @@ class CityMesh:
             data["region"] = [np.concatenate(regions), np.full(len(facets), -1, np.int8)]
         return meshio.Mesh(points, [("tetra", cells), ("triangle", facets)], cell_data=data)
 
-    def replace(self, building: str, file: Path | str, *, date: str = "", base: int | None = None) -> "CityMesh":
+    def replace(
+        self,
+        building: str,
+        file: Path | str,
+        *,
+        position: Sequence[float] | None = None,
+        date: str = "",
+        base: int | None = None,
+    ) -> "CityMesh":
         """Put the footprint of a vector file in the place of a building: `citystitch edit --replace`.
 
         Parameters
@@ -343,7 +351,9 @@ class CityMesh:
         building : str
             Id of its footprint.
         file : Path or str
-            Vector file with one footprint.
+            Vector file with one footprint; CityJSON or GLB with one building.
+        position : 3 floats, optional
+            Easting, northing and height (m) of the origin of a GLB file.
         date : str
             Day from which on it holds, YYYY-MM-DD; today by default.
         base : int, optional
@@ -359,15 +369,22 @@ class CityMesh:
         CityError
             If the edit is refused or fails; the city is as before.
         """
-        return self._edit("replace", building, Path(file), date=date, base=base)
+        return self._edit("replace", building, file, position, date=date, base=base)
 
     def remove(self, building: str, *, date: str = "", base: int | None = None) -> "CityMesh":
         """Take a building away: `citystitch edit --remove`; all else as for `replace`."""
         return self._edit("remove", building, None, date=date, base=base)
 
-    def add(self, file: Path | str, *, date: str = "", base: int | None = None) -> "CityMesh":
+    def add(
+        self,
+        file: Path | str,
+        *,
+        position: Sequence[float] | None = None,
+        date: str = "",
+        base: int | None = None,
+    ) -> "CityMesh":
         """Add the footprints of a vector file: `citystitch edit --add`; all else as for `replace`."""
-        return self._edit("add", "", Path(file), date=date, base=base)
+        return self._edit("add", "", file, position, date=date, base=base)
 
     def at(self, date: str, out: Path | str) -> "CityMesh":
         """Make the city of a day in another folder: `citystitch edit --at`.
@@ -399,10 +416,19 @@ class CityMesh:
 
         return list_edits(self.folder)
 
-    def _edit(self, action: str, building: str, file: Path | None, *, date: str, base: int | None) -> "CityMesh":
+    def _edit(
+        self,
+        action: str,
+        building: str,
+        file: Path | str | None,
+        position: Sequence[float] | None = None,
+        **given: Any,
+    ) -> "CityMesh":
         from tiler.editing.edit import edit_city
+        from tiler.editing.uploads import Upload
 
-        edit_city(self.folder, action, building, file, date=date, base=base)
+        upload = None if file is None else Upload(Path(file), position)
+        edit_city(self.folder, action, building, upload, **given)
         return CityMesh(self.folder)
 
     def buildings(self) -> Iterator[Building]:

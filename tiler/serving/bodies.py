@@ -1,5 +1,6 @@
 """What a client asks for: JSON bodies as edits, checked before anything waits for them."""
 
+import base64
 import hashlib
 import json
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from pipeline.data.citymodel import Footprints
 from pipeline.data.errors import InputError
 from tiler.editing.edit import City
 from tiler.editing.requests import ACTIONS, Asked, read_date
-from tiler.editing.uploads import read_upload
+from tiler.editing.uploads import Upload, read_upload
 
 MOST_BYTES = 2**20  # of a body
 TEXT = {"type": "string", "minLength": 1, "maxLength": 200}
@@ -35,6 +36,8 @@ SCHEMA = {
         "height": {"type": "number", "exclusiveMinimum": 0, "maximum": 10_000},
         "crs": TEXT,
         "cityjson": {"type": "object"},
+        "glb": {"type": "string", "contentEncoding": "base64"},
+        "position": {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
         "date": {"type": "string"},
         "base": {"type": "integer", "minimum": 0},
     },
@@ -52,15 +55,17 @@ def read_body(data: bytes) -> dict[str, Any]:
         place = ".".join(map(str, wrong.absolute_path)) or "body"
         raise InputError(f"{place}: {wrong.message}; see docs/serve.md")
     body: dict[str, Any] = found
-    given = [name for name in ("footprint", "cityjson") if name in body]
+    given = [name for name in WRITERS if name in body]
     if len(given) != (body["action"] != "remove"):
-        raise InputError(f"{body['action']}: has {' and '.join(given) or 'neither'}; replace and add take one of "
-                         "footprint and cityjson, remove none")  # fmt: skip
+        raise InputError(f"{body['action']}: has {' and '.join(given) or 'none'}; replace and add take one of "
+                         f"{', '.join(WRITERS)}, remove none")  # fmt: skip
     if body["action"] != "add" and "building" not in body:
         raise InputError(f"{body['action']}: has no building; name the one that is meant")
     if stray := sorted({"height", "crs"} & body.keys()) if "footprint" not in body else []:
         raise InputError(f"{stray[0]}: is for a footprint; leave it out")
-    if "footprint" in body and "building" not in body:
+    if "position" in body and "glb" not in body:
+        raise InputError("position: is for a glb; leave it out")
+    if body["action"] == "add" and "cityjson" not in body and "building" not in body:
         raise InputError("add: has no building; give the new one an id")
     return body
 
@@ -73,14 +78,14 @@ def make_asked(body: Mapping[str, Any], city: City) -> Asked:
     upload, source = None, ""
     if body["action"] != "remove":
         with TemporaryDirectory(prefix="citystitch-") as folder:
-            write = _write_footprint if "footprint" in body else _write_model
+            (write,) = (write for name, write in WRITERS.items() if name in body)
             path = write(body, city, Path(folder))
-            source = path.name
+            source, given = path.name, Upload(path, body.get("position"))
             try:
-                upload = read_upload(path, city.config, crs=city.crs, bounds=city.bounds)
+                upload = read_upload(given, city.config, crs=city.crs, bounds=city.bounds)
             except InputError as error:
                 raise InputError(str(error).replace(f"{path}: ", "")) from None
-    if upload is not None and "footprint" in body:
+    if upload is not None and "cityjson" not in body:
         upload = _name(upload, body)
     return Asked(
         *(body["action"], body.get("building", ""), upload, source),
@@ -117,8 +122,20 @@ def _write_model(body: Mapping[str, Any], city: City, folder: Path) -> Path:
     return path
 
 
+def _write_glb(body: Mapping[str, Any], city: City, folder: Path) -> Path:
+    path = folder / "building.glb"
+    try:
+        path.write_bytes(base64.b64decode(body["glb"], validate=True))
+    except ValueError as error:
+        raise InputError(f"glb: is not in base64 ({error}); encode the file so") from None
+    return path
+
+
 def _name(upload: Footprints, body: Mapping[str, Any]) -> Footprints:
-    """Give footprints the id and height of a body."""
+    """Give buildings the id of a body, and footprints its height."""
     n = len(upload.ids)
-    height = body.get("height", np.nan)
-    return replace(upload, ids=np.full(n, body["building"]), given_height=np.full(n, height, np.float64))
+    height = np.full(n, body.get("height", np.nan), np.float64) if "footprint" in body else upload.given_height
+    return replace(upload, ids=np.full(n, body["building"]), given_height=height)
+
+
+WRITERS = {"footprint": _write_footprint, "cityjson": _write_model, "glb": _write_glb}

@@ -3,9 +3,10 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
 
 from pipeline.data.errors import CityError, ConfigError, OutputError
-from tiler.editing.edit import City, Outcome, edit_together
+from tiler.editing.edit import City, Outcome, edit_together, write_city_files
 from tiler.editing.requests import Asked
 from tiler.engine.executor import Executor
 from tiler.store.edit_journal import Edit, read_journal
@@ -13,7 +14,8 @@ from tiler.store.remembered import remembering
 from tiler.words.plain_text import say_nothing
 
 MOST_WAITING = 100  # edits
-REST, MESHING, TILES = "at rest", "meshing", "writing tiles"  # what the writer does
+CALM = 2.0  # s without an edit, after which the files of the city models are written
+REST, MESHING, TILES, FILES = "at rest", "meshing", "writing tiles", "writing city models"  # what the writer does
 
 
 class BusyError(OutputError):
@@ -29,8 +31,9 @@ class EditQueue:
         What is edited.
     after : callable
         Called with the number of the last edit when some were done: it brings the tiles up to date.
-    executor : Executor, optional
-        Runs the tasks of all edits.
+    open_executor : callable
+        Gives what runs the tasks of all edits, or None; it is opened and closed by the thread that edits, as the
+        client of Dask must be.
     say : callable
         Called with sentences that the user should read.
 
@@ -39,19 +42,19 @@ class EditQueue:
     journal : list of Edit
         All edits that are done.
     state : str
-        `REST`, `MESHING` or `TILES`.
+        `REST`, `MESHING`, `TILES` or `FILES`.
     trouble : str
-        Why the tiles are not up to date.
+        Why tiles or city models are not up to date.
     """
 
     def __init__(
         self,
         city: City,
         after: Callable[[int], None],
-        executor: Executor | None = None,
+        open_executor: Callable[[], AbstractContextManager[Executor | None]] = nullcontext,
         say: Callable[[str], None] = say_nothing,
     ) -> None:
-        self._city, self._after, self._executor, self._say = city, after, executor, say
+        self._city, self._after, self._open_executor, self._say = city, after, open_executor, say
         self._changed = threading.Condition()
         self._waiting: list[tuple[Asked, Future[Outcome]]] = []
         self._at_work: list[tuple[Asked, Future[Outcome]]] = []
@@ -120,33 +123,43 @@ class EditQueue:
             return (waiting | done).get(request) if request else None
 
     def _work(self) -> None:
-        with remembering():
-            self._edit_until_ended()
+        with remembering(), self._open_executor() as executor:
+            self._edit_until_ended(executor)
 
-    def _edit_until_ended(self) -> None:
-        while True:
+    def _edit_until_ended(self, executor: Executor | None) -> None:
+        calm = True
+        while not (self._ended and calm):
             with self._changed:
-                self._changed.wait_for(lambda: bool(self._waiting) or self._ended)
-                if self._ended:
-                    return
+                self._changed.wait_for(lambda: bool(self._waiting) or self._ended, None if calm else CALM)
                 self._at_work, self._waiting = self._waiting, []
-            self.state = MESHING
-            self._edit()
-            self.state = TILES
-            try:
-                self._after(self.revision)
-                self.trouble = ""
-            except Exception as error:  # the city is edited: the next edit tries again
-                self.trouble = f"{type(error).__name__}: {error}"
-                self._say(f"the 3D Tiles are not up to date: {self.trouble}")
-            self.state = REST
+            if self._at_work:
+                self.state, calm = MESHING, False
+                self._edit(executor)
+                self.state = TILES
+                self._follow(lambda: self._after(self.revision))
+                self.state = FILES
+            elif not calm:
+                late, calm = bool(self.trouble), True
+                self._follow(lambda: write_city_files(self._city, executor))
+                if late:  # all tiles are made of these files
+                    self._follow(lambda: self._after(self.revision))
+                self.state = REST
 
-    def _edit(self) -> None:
+    def _follow(self, work: Callable[[], None]) -> None:
+        """Bring something up to date that follows the mesh; if that fails, the next edit tries again."""
+        try:
+            work()
+            self.trouble = ""
+        except Exception as error:
+            self.trouble = f"{type(error).__name__}: {error}"
+            self._say(f"3D Tiles or city models are not up to date: {self.trouble}")
+
+    def _edit(self, executor: Executor | None) -> None:
         """Do all edits at work, and tell each client what came of its own."""
         outcomes: list[Outcome | CityError] | list[Exception]
         try:
             asked = [one for one, _ in self._at_work]
-            outcomes = edit_together(self._city, asked, executor=self._executor, say=self._say)
+            outcomes = edit_together(self._city, asked, executor=executor, city_files=False, say=self._say)
         except Exception as error:  # whatever it is: clients are told, and the next edit has its turn
             outcomes = [error for _ in self._at_work]
         with self._changed:

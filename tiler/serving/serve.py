@@ -2,21 +2,24 @@
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import ConfigError
 from tiler.config.config import Config
 from tiler.dashboard.server import is_loopback, serve_rules
-from tiler.editing.edit import held_city
+from tiler.editing.edit import held_city, write_city_files
 from tiler.engine.executor import Executor, OnDemand
 from tiler.engine.task_limits import limit_workers
 from tiler.mesh_files.run_files import find_files
 from tiler.serving.bodies import MOST_BYTES
 from tiler.serving.edit_queue import EditQueue
 from tiler.serving.handlers import COOKIE, CityState, EditList, Keyed, OneEdit, Service, cookie_of
+from tiler.serving.section import Section
+from tiler.tiles3d.globe import Globe
 from tiler.tiles3d.update import TILES, update_tileset
 from tiler.tiles3d.view import PAGE, Files
 from tiler.words.plain_text import say_nothing
@@ -27,6 +30,11 @@ FOLDER = "view"  # below that of the run, with its 3D Tiles
 
 class KeyedFiles(Keyed, Files):
     """Files of a folder for those who have the token."""
+
+    def set_extra_headers(self, path: str) -> None:
+        """Tell the page that the mesh is there, to be cut."""
+        super().set_extra_headers(path)
+        self.set_header("Citystitch-Section", "yes")
 
 
 class Page(KeyedFiles):
@@ -109,17 +117,19 @@ def serve_city(
 
     with ExitStack() as stack:
         city = stack.enter_context(held_city(directory, workers, say))
+        write_city_files(city)  # which a killed server has left
         write_tiles(0)
-        executor = stack.enter_context(_warm_executor(workers, city.config)) if workers else None
-        queue = EditQueue(city, write_tiles, executor, say)
-        service = Service(city, queue, token)
+        open_executor = partial(_warm_executor, workers, city.config) if workers else nullcontext
+        queue = EditQueue(city, write_tiles, open_executor, say)
+        service, globe = Service(city, queue, token), Globe(city.crs, city.bounds, **vars(given))
 
         def rules(loopback: bool) -> list[Any]:
-            own = {"service": service, "loopback": loopback}
+            own = {"service": service, "loopback": loopback, "globe": globe}
             given: list[tuple[str, type[Keyed], dict[str, str]]] = [
                 ("/city", CityState, {}),
                 ("/edits", EditList, {}),
                 ("/edits/(.+)", OneEdit, {}),
+                ("/section", Section, {}),
                 ("/tiles/(.*)", KeyedFiles, {"path": str((folder / TILES).resolve())}),
                 ("/(.*)", Page, PAGE),
             ]

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from pipeline.city_model.sloped_solids import ROOF, WALL
 from pipeline.data.errors import InputError
@@ -302,8 +301,9 @@ def draw_units(units: Sequence[Unit]) -> Layer | None:
     several = Counter(unit.house for unit in units)
     rows: list[dict[str, Any]] = []
     surfaces: list[Surface] = []
+    blocks = _extrude([unit for unit in units if unit.part is None])
     for unit in units:
-        surface = _extrude(unit) if unit.part is None else _draw_part(unit.part)
+        surface = next(blocks) if unit.part is None else _draw_part(unit.part)
         if surface is None:
             continue
         surfaces.append(replace(surface, feature=np.full(len(surface.xyz), len(rows))))
@@ -327,26 +327,34 @@ def _draw_part(part: Part) -> Surface:
     return Surface(np.array(part.xyz), np.array(part.triangles, np.int64), material, np.empty(0, np.int64))
 
 
-def _extrude(unit: Unit) -> Surface | None:
-    """Make walls and roof of a block; None where its outline has no area."""
-    outline = shapely.orient_polygons(unit.outline)
-    cut = shapely.get_coordinates(shapely.orient_polygons(shapely.constrained_delaunay_triangles(outline)))
-    roof = cut.reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
-    if not len(roof):
-        return None
-    top = (unit.low + unit.high) / 2
+def _extrude(units: Sequence[Unit]) -> Iterator[Surface | None]:
+    """Make walls and roof of blocks, all at a time; None for one whose outline has no area."""
+    outlines = shapely.orient_polygons(np.array([unit.outline for unit in units], np.object_))
+    cuts = shapely.orient_polygons(shapely.constrained_delaunay_triangles(outlines))
+    xy, owner = shapely.get_coordinates(cuts, return_index=True)
+    roof = np.column_stack((owner, xy)).reshape(-1, 4, 3)[:, :3].reshape(-1, 3)
     places, inverse = np.unique(roof, axis=0, return_inverse=True)
     corners: Ints = inverse.reshape(-1, 3).astype(np.int64)
-    xy, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(outline)), return_index=True)
+    parts, of_part = shapely.get_parts(outlines, return_index=True)
+    rings, of_ring = shapely.get_rings(parts, return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
     first = np.flatnonzero(ring[1:] == ring[:-1])
-    a, b = xy[first], xy[first + 1]
-    n, k = len(places), 4 * np.arange(len(a))[:, np.newaxis]
-    walls = np.stack((_at(a, unit.bottom), _at(b, unit.bottom), _at(b, top), _at(a, top)), axis=1)
-    triangles: Ints = np.concatenate((corners, n + k + [0, 1, 2], n + k + [0, 2, 3]))
-    material = np.repeat(np.array([Marker.ROOF, Marker.WALL], np.int64), [len(roof) // 3, 2 * len(a)])
-    xyz = np.concatenate((_at(places, top), walls.reshape(-1, 3)))
-    return Surface(xyz, triangles, material, np.empty(0, np.int64))
-
-
-def _at(xy: Array, z: float) -> NDArray[np.float64]:
-    return np.column_stack((xy, np.full(len(xy), z)))
+    of_wall = of_part[of_ring[ring[first]]]
+    bottom = np.array([unit.bottom for unit in units], np.float64)
+    top = np.array([(unit.low + unit.high) / 2 for unit in units], np.float64)
+    a, b, low, high = xy[first], xy[first + 1], bottom[of_wall], top[of_wall]
+    ways = (a, low), (b, low), (b, high), (a, high)
+    walls = np.stack([np.column_stack(way) for way in ways], axis=1)
+    starts = (np.searchsorted(of, np.arange(len(units) + 1)) for of in (places[:, 0], roof[::3, 0], of_wall))
+    for k, (place, corner, wall) in enumerate(zip(*(map(slice, some, some[1:]) for some in starts), strict=True)):
+        own, n = places[place, 1:], place.stop - place.start
+        if not n:
+            yield None
+            continue
+        quad = n + 4 * np.arange(wall.stop - wall.start)[:, np.newaxis]
+        halves = np.add(quad, [0, 1, 2]), np.add(quad, [0, 2, 3])
+        triangles: Ints = np.concatenate((corners[corner] - place.start, *halves))
+        counts = [corner.stop - corner.start, 2 * len(quad)]
+        material = np.repeat(np.array([Marker.ROOF, Marker.WALL], np.int64), counts)
+        xyz = np.concatenate((np.column_stack((own, np.full(n, top[k]))), walls[wall].reshape(-1, 3)))
+        yield Surface(xyz, triangles, material, np.empty(0, np.int64))

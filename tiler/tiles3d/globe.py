@@ -123,6 +123,12 @@ def geocentric(places: Array) -> Array:
     return np.column_stack(_ECEF.transform(*places.T))
 
 
+def geographic_of(places: Array) -> Array:
+    """Give longitude, latitude (degrees) and height (m) of geocentric coordinates (n, 3)."""
+    x, y, z = places.T
+    return np.column_stack(_ECEF.transform(x, y, z, direction="INVERSE"))
+
+
 def local_frame(lon: float, lat: float, height: float) -> Array:
     """Give the matrix (4, 4) from metres to the east, the north and up from a place to geocentric metres.
 

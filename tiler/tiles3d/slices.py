@@ -57,12 +57,10 @@ def cut_pieces(pieces: MeshPieces, slices: list[Slice]) -> Iterator[Array]:
         piece = pieces.read(k)
         quality = measure_cells(TetMesh(piece.points, piece.cells)).radius_ratio
         for one in slices:
-            corners, cell = cut_cells(piece.points, piece.cells, _levels(one, piece))
-            if one.line is not None:
-                start, way = np.array(one.line[:2]), np.subtract(one.line[2:], one.line[:2])
-                along = ((corners.mean(axis=1)[:, :2] - start) * way).sum(axis=1) / (way**2).sum()
-                kept = (along >= 0) & (along <= 1)
-                corners, cell = corners[kept], cell[kept]
+            if one.line is None:
+                corners, cell = cut_cells(piece.points, piece.cells, _levels(one, piece))
+            else:
+                corners, cell = cut_along(one.line, piece.points, piece.cells)
             found[one] += len(cell)
             yield np.column_stack((corners.reshape(-1, ROW - 1), quality[cell]))
     for one, n in found.items():
@@ -70,13 +68,20 @@ def cut_pieces(pieces: MeshPieces, slices: list[Slice]) -> Iterator[Array]:
             raise ConfigError(f"{one.option}: meets no cell of the mesh; give another, in metres of its CRS")
 
 
+def cut_along(
+    line: tuple[float, float, float, float], points: Array, cells: NDArray[np.int32]
+) -> tuple[Array, NDArray[np.int64]]:
+    """Cut tetrahedra upright from one place in the CRS to another; see `cut_cells`."""
+    start, way = np.array(line[:2]), np.subtract(line[2:], line[:2])
+    away = points[:, :2] - start
+    corners, cell = cut_cells(points, cells, (away[:, 0] * way[1] - away[:, 1] * way[0]) / np.hypot(*way))
+    along = ((corners.mean(axis=1)[:, :2] - start) * way).sum(axis=1) / (way**2).sum()
+    kept = (along >= 0) & (along <= 1)
+    return corners[kept], cell[kept]
+
+
 def _levels(one: Slice, piece: MeshPiece) -> Array:
-    """Give the distance of each point (n,) from a slice (m), positive on one side."""
-    if one.line is not None:
-        x, y, u, v = one.line
-        way = np.hypot(u - x, v - y)
-        across: Array = ((piece.points[:, 0] - x) * (v - y) - (piece.points[:, 1] - y) * (u - x)) / way
-        return across
+    """Give the height of each point (n,) above a slice that follows the ground (m)."""
     ground = piece.points[np.unique(piece.facets[is_ground(piece.marker)])]
     if not len(ground):
         return np.ones(len(piece.points))

@@ -1,9 +1,9 @@
 """A tileset that follows the edits of its run: cells that they touch, and those above as far as they change."""
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from itertools import product
+from math import floor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,10 +25,18 @@ from tiler.tiles3d.slices import ROW as SLICE_ROW
 from tiler.tiles3d.subtrees import SUBTREE_LEVELS, Tile, subtree_path, write_tree
 from tiler.tiles3d.terrain import ROW
 from tiler.tiles3d.tileset import content_path, export_tileset, find_lowest, write_content, write_root
-from tiler.tiles3d.update_state import MODEL, RunTile, UpdateState, hash_rows, make_run_tile, read_stamps
+from tiler.tiles3d.update_state import (
+    MODEL,
+    RunTile,
+    UpdateState,
+    hash_rows,
+    lowest_ground,
+    make_run_tile,
+    read_stamps,
+)
 
 TILES, MADE = "tiles", "made"  # below the folder: the tileset, and what is kept beside it
-SCHEMA = 1  # version of the latter
+SCHEMA = 2  # version of the latter
 
 
 def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, vertical_crs: str = "") -> int:
@@ -77,6 +85,7 @@ class _Update:
         self._base, self._files, self._kept, self._folder = base, files, kept, folder
         self._store = Store(files.directory / STORE)
         self._pieces: dict[str, SortedPiece] = {}  # those that were read
+        self._origin, self._moved = kept.read_origin(), False
         self._tree: dict[Cell, Tile] = {}
         self._made = 0
 
@@ -91,7 +100,12 @@ class _Update:
         kept.begin()
         new = dict(old)
         for name in changed:
-            new[name] = make_run_tile(stamps[name], self._piece(name), old[name].parts)
+            arrays, _ = self._store.read(MODEL, name, names=("ground",))
+            ground = lowest_ground(arrays)
+            new[name] = make_run_tile(stamps[name], self._piece(name), old[name].parts, ground)
+        low = min((tile.ground_height for tile in new.values() if tile.ground_height is not None), default=0.0)
+        self._moved = floor(low) != self._origin[2]  # then coordinates have other last digits in all parts
+        self._origin[2] = float(floor(low))
         lowest = find_lowest(tile.numbers for tile in new.values())
         before = find_lowest(tile.numbers for tile in old.values())
         moved = {number for number in before.keys() | lowest.keys() if before.get(number) != lowest.get(number)}
@@ -118,7 +132,7 @@ class _Update:
         for name in names:
             if new[name] is not old[name]:
                 kept.save_run(name, new[name])
-        kept.finish(self._tree)
+        kept.finish(self._tree, self._origin)
         return self._made
 
     def _piece(self, name: str) -> SortedPiece:
@@ -131,6 +145,7 @@ class _Update:
     ) -> tuple[set[str], list[Part], dict[str, tuple[str, int, str]]]:
         """Find the buildings of a tile that changed: ids, the parts that are there now, and all rows."""
         touched = {one for one, (_, number, _, _) in old.parts.items() if number in moved}
+        touched |= old.parts.keys() if self._moved else set()
         if not touched and old.model == model:
             return set(), [], {}
         arrays, _ = self._store.read(MODEL, name)
@@ -144,12 +159,10 @@ class _Update:
         some = take_buildings(buildings, np.flatnonzero(np.isin(buildings.model.ids, sorted(touched))))
         if not len(some.model):
             return touched, [], rows
-        with (self._files.directory / CITY_MODEL).open("rb") as file:  # its first line has the origin
-            origin = json.loads(file.readline().rstrip(b",\n") + b"}")["transform"]["translate"]
         with TemporaryDirectory() as temporary:
             path = Path(temporary) / CITY_MODEL
             block = some.model, describe_buildings(some, RoofFits())
-            write_city_blocks(path, [block], crs=self._base.crs, bounds=(*origin, *origin))
+            write_city_blocks(path, [block], crs=self._base.crs, bounds=(*self._origin, *self._origin))
             return touched, list(read_parts(path, lowest, Counter())), rows
 
     def _make(

@@ -3,6 +3,7 @@
 ::
 
     state.json                  what all of it is of; missing while it is changed
+    origin.json                 origin of the city model, from where coordinates of buildings were counted
     tree.json                   what the tree tells of each cell by itself
     cells/{level}/{x}/{y}.json  what a cell hands to the one above it
     runs/{tile}.json            what cells took from a tile of the run
@@ -10,7 +11,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import shapely
 from tiler.citymodels.tables import BUILDING_ARRAYS, Arrays, rows_by_id
 from tiler.mesh_files.run_files import RunFiles
 from tiler.store.atomic import replacing
-from tiler.store.out_folder import MANIFEST_PATH, STORE
+from tiler.store.out_folder import CITY_MODEL, MANIFEST_PATH, STORE
 from tiler.store.store import Store
 from tiler.tiles3d.base import Made, SortedPiece
 from tiler.tiles3d.buildings import Part, Unit, make_units
@@ -47,6 +48,8 @@ class RunTile:
         Lowest wall (m) of each building of the piece, by number.
     parts : dict of str to (str, int, str, int or None)
         House, number, hash and smallest cell of each building or part that it owns, by id; None without a solid.
+    ground_height : float or None
+        Lowest ground (m) of these.
     """
 
     model: str
@@ -54,6 +57,7 @@ class RunTile:
     ground: dict[str, str]
     lowest: dict[str, float]
     parts: dict[str, tuple[str, int, str, int | None]]
+    ground_height: float | None
 
     @property
     def numbers(self) -> dict[int, float]:
@@ -86,8 +90,9 @@ class UpdateState:
         """Say that all of it is being changed: whoever finds it so cannot use it."""
         (self._folder / "state.json").unlink()
 
-    def finish(self, tree: Mapping[Cell, Tile]) -> None:
-        """Say that all is there."""
+    def finish(self, tree: Mapping[Cell, Tile], origin: Sequence[float]) -> None:
+        """Say that all is there, and from where the coordinates of the buildings were counted."""
+        self._write("origin", origin)
         rows = [[*cell, *tile.region, tile.error] for cell, tile in sorted(tree.items())]
         self._write("tree", rows)
         self._write("state", self._state)
@@ -107,8 +112,14 @@ class UpdateState:
                 one: (house, number, row, places.get(one))
                 for one, (house, number, row) in hash_rows(arrays).items()
             }
-            self.save_run(name, make_run_tile(stamps[name], piece, parts))
-        self.finish(tree)
+            self.save_run(name, make_run_tile(stamps[name], piece, parts, lowest_ground(arrays)))
+        with (files.directory / CITY_MODEL).open("rb") as file:  # its first line has the origin
+            origin = json.loads(file.readline().rstrip(b",\n") + b"}")["transform"]["translate"]
+        self.finish(tree, origin)
+
+    def read_origin(self) -> list[float]:
+        """Read from where the coordinates of the buildings were counted: the origin of the city model."""
+        return list(self._read("origin"))
 
     def save(self, cell: Cell, made: Made) -> bool:
         """Keep what a cell hands up; returns whether it differs from what it handed up before."""
@@ -170,11 +181,20 @@ def read_stamps(files: RunFiles) -> dict[str, tuple[str, str]]:
 
 
 def make_run_tile(
-    stamps: tuple[str, str], piece: SortedPiece, parts: Mapping[str, tuple[str, int, str, int | None]]
+    stamps: tuple[str, str],
+    piece: SortedPiece,
+    parts: Mapping[str, tuple[str, int, str, int | None]],
+    ground_height: float | None,
 ) -> RunTile:
     """Put together what is kept of a tile of the run."""
     ground = {str(code): digest for code, digest in piece.digests.items()}
-    return RunTile(*stamps, ground, {str(number): z for number, z in piece.lowest.items()}, dict(parts))
+    lowest = {str(number): z for number, z in piece.lowest.items()}
+    return RunTile(*stamps, ground, lowest, dict(parts), ground_height)
+
+
+def lowest_ground(arrays: Arrays) -> float | None:
+    """Give the lowest ground (m) of the buildings of the stage `MODEL`; None without any."""
+    return float(arrays["ground"].min()) if len(arrays["ground"]) else None
 
 
 def hash_rows(arrays: Arrays) -> dict[str, tuple[str, int, str]]:

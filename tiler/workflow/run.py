@@ -87,11 +87,14 @@ class _Means:
         Folder of the events that the page is made of.
     cluster : Executor or None
         Of the scheduler that was asked for, or what the caller gave.
+    city_files : bool
+        Whether the files of the city models are written.
     """
 
     dashboard: str | None
     shown: Path
     cluster: Executor | None
+    city_files: bool
 
 
 def run(
@@ -103,6 +106,7 @@ def run(
     dashboard: str | None = None,
     within: Path | None = None,
     executor: Executor | None = None,
+    city_files: bool = True,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -123,6 +127,8 @@ def run(
         Folder of a disk to work in, whose files are moved to ``out`` of `config` later; ``out`` itself by default.
     executor : Executor, optional
         Runs the tasks; by default one is made as `config` says, for this run alone.
+    city_files : bool
+        Whether the files of the city models are written; the next run that does brings them up to date.
 
     Returns
     -------
@@ -163,7 +169,7 @@ def run(
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
             with _connect(config) as cluster:
-                means = _Means(dashboard, shown, executor or cluster)
+                means = _Means(dashboard, shown, executor or cluster, city_files)
                 try:
                     return _run(config, out, earlier, damage, own, told, means)
                 except StoppedError:
@@ -281,7 +287,7 @@ def _mesh_region(
             engine = make_engine(config, out, plan, executor, own, watchers)
             with stops(engine.stop, watchers.say):
                 try:
-                    rounds = run_stages(engine, config, edits, former=former)
+                    rounds = run_stages(engine, config, edits, former=former, city_files=means.city_files)
                 except HolesError:
                     plan, missing = leave_holes(plan, missing, engine)
                     watchers.say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")

@@ -39,7 +39,14 @@ NO_EDITS = Edits()
 MODEL = "model"
 
 
-def run_stages(engine: Engine, config: Config, edits: Edits = NO_EDITS, *, former: Path | None = None) -> int:
+def run_stages(
+    engine: Engine,
+    config: Config,
+    edits: Edits = NO_EDITS,
+    *,
+    former: Path | None = None,
+    city_files: bool = True,
+) -> int:
     """Run all stages in their order; returns how often clusters of houses were simplified.
 
     Parameters
@@ -52,13 +59,15 @@ def run_stages(engine: Engine, config: Config, edits: Edits = NO_EDITS, *, forme
         What edits of its folder come to.
     former : Path, optional
         Store of which that of the engine was a copy when the run began.
+    city_files : bool
+        Whether the files of the city models are written.
     """
     rounds = run_city_stages(engine, config, edits)
     if former is not None:
         engine.changes = _find_changes(engine, Store(former))
     domain = resolve_domain(engine, config)
     # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
-    of_model = [fit_stage(config), *city_model_stages(config), *canopy_stages(config)]
+    of_model = [fit_stage(config), *(city_model_stages(config) if city_files else ()), *canopy_stages(config)]
     if config.footprints and not config.align:
         of_model = [*alignment_stages(config), *of_model]
     meshed = [*cover_stages(config), *mesh_stages(config, domain), *piece_stages(config)]

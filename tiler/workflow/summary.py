@@ -154,7 +154,7 @@ def _describe_cover(records: Records, config: Config) -> dict[str, Any]:
 
 def _roof_fit(records: Records) -> dict[str, Any]:
     """Describe how roofs of planes fit their points."""
-    facts = records["citymodel", REGION_ITEM].facts
+    facts = records["citymodel", REGION_ITEM].facts if ("citymodel", REGION_ITEM) in records else {}
     return {name: facts[name] for name in ("roof_fit", "worst_roofs") if name in facts}
 
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyogrio
@@ -26,8 +27,9 @@ from tiler.config.config import make_config
 from tiler.editing.edit import list_edits
 from tiler.editing.requests import find_unused_heights
 from tiler.editing.staging import DONE_NOW, NOT_DONE
-from tiler.editing.uploads import read_upload
+from tiler.editing.uploads import Upload, read_upload
 from tiler.store.edit_journal import Edit, edit_path
+from tiler.tiles3d.gltf import begin_glb
 from tiler.workflow.audit import Audit
 from tiler.workflow.run import run
 
@@ -160,7 +162,9 @@ def test_an_upload_in_another_crs_is_taken_to_that_of_the_region(edited: Path, t
     region, there = record["region"], pyproj.Transformer.from_crs(CRS, 4326, always_xy=True)
     far = shapely.transform(shape, lambda xy: np.stack(there.transform(*xy.T), axis=1))
     path = write(tmp_path / "far.geojson", far, ids=["x"], crs="EPSG:4326")
-    found = read_upload(path, make_config(record["parameters"]), crs=region["crs"], bounds=region["bounds"])
+    found = read_upload(
+        Upload(path), make_config(record["parameters"]), crs=region["crs"], bounds=region["bounds"]
+    )
     assert shape.hausdorff_distance(found.polygons[0]) < 0.01
 
 
@@ -174,13 +178,67 @@ def test_a_building_of_cityjson_is_an_outline_with_a_height(edited: Path, tmp_pa
     )
     path = tmp_path / "a.city.json"
     write_city_model(path, model, crs=CRS, bounds=(x, y, 0, x + 9, y + 9, 20))
-    found = read_upload(path, make_config(record["parameters"]), crs=crs, bounds=bounds)
+    found = read_upload(Upload(path), make_config(record["parameters"]), crs=crs, bounds=bounds)
     assert (found.ids.tolist(), found.given_height.tolist()) == (["a"], [pytest.approx(9.5)])
     assert found.polygons[0].equals(square[0])
     far = tmp_path / "far.city.json"
     far.write_text(path.read_text().replace(f'"translate":[{x // 1}', f'"translate":[{x // 1 + 5000}'))
     with pytest.raises(InputError, match="0 of 1 buildings meet the region"):
-        read_upload(far, make_config(record["parameters"]), crs=crs, bounds=bounds)
+        read_upload(Upload(far), make_config(record["parameters"]), crs=crs, bounds=bounds)
+
+
+def test_a_building_of_glb_stands_at_its_position_with_the_mean_height_of_its_roof(
+    edited: Path, tmp_path: Path
+) -> None:
+    record = json.loads((edited / "run.json").read_text())
+    bounds, crs = record["region"]["bounds"], record["region"]["crs"]
+    x, y = bounds[0] + 40, bounds[1] + 30
+    path = write_house(tmp_path / "house.glb", extras={"origin": [x, y, 2.0]})
+    given: dict[str, Any] = {"config": make_config(record["parameters"]), "crs": crs, "bounds": bounds}
+    found = read_upload(Upload(path), **given)
+    assert (found.ids.tolist(), found.given_height.tolist()) == (["house"], [pytest.approx(7.5, abs=0.01)])
+    assert found.polygons[0].symmetric_difference(shapely.box(x + 1, y, x + 9, y + 6)).area < 0.01
+    moved = read_upload(Upload(path, (x + 50, y, 2.0)), **given).polygons[0]
+    assert moved.equals(affinity.translate(found.polygons[0], 50.0))
+    for data, words in (
+        (write_house(tmp_path / "x.glb").read_bytes(), "give the position"),
+        (
+            write_house(tmp_path / "x.glb", extensionsRequired=["KHR_draco_mesh_compression"]).read_bytes(),
+            "without",
+        ),
+        (path.read_bytes()[:-40], "is no GLB file"),
+        (path.read_bytes().replace(b'"count":8', b'"count":9'), "beyond its part"),
+    ):
+        (tmp_path / "x.glb").write_bytes(data)
+        with pytest.raises(InputError, match=words):
+            read_upload(Upload(tmp_path / "x.glb"), **given)
+
+
+def write_house(path: Path, extras: dict[str, Any] | None = None, **more: Any) -> Path:
+    """Write a house of 8 x 6 m with a floor, two walls and a roof from 6 to 9 m."""
+    low = [[0.0, 0.0, 0.0], [8.0, 0.0, 0.0], [8.0, 0.0, -6.0], [0.0, 0.0, -6.0]]
+    top = [[x, 6.0 - z / 2, z] for x, _, z in low]
+    places = np.array([*low, *top], np.float32)
+    faces = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4], [2, 3, 7], [2, 7, 6]])
+    data = places.tobytes() + faces.astype(np.uint8).tobytes()
+    document = {
+        "asset": {"version": "2.0"} | ({"extras": extras} if extras else {}),
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"children": [1], "translation": [1, 0, 0]}, {"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5121, "count": faces.size, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 96},
+            {"buffer": 0, "byteOffset": 96, "byteLength": faces.size},
+        ],
+        "buffers": [{"byteLength": len(data)}],
+    }
+    text = json.dumps(document | more, separators=(",", ":")).encode()
+    path.write_bytes(begin_glb(text, len(data)) + data)
+    return path
 
 
 def test_a_height_that_roof_points_overrule_is_told(small_run: Path) -> None:

@@ -31,4 +31,6 @@ def test_the_page_shows_an_edit(sloped_run: Path, tmp_path: Path, monkeypatch: p
     assert of_house("before")
     assert not of_house("after")
     assert len(seen["after"]["names"]) == len(seen["before"]["names"]) - len(of_house("before"))
+    assert "cells of the section" in seen["section"]["words"]
+    assert (seen["section"]["pressed"], seen["section"]["left"], seen["overflow"]) == ("true", 0, 0)
     assert seen["after"]["camera"] == seen["before"]["camera"]

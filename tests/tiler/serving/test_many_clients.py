@@ -24,6 +24,7 @@ from tests.tiler.serving.test_service import ask, footprint
 from tests.tiler.tiles3d.test_update import read_all
 from tiler.config.config import make_config
 from tiler.export.export import export_run
+from tiler.serving.edit_queue import REST
 from tiler.workflow.audit import Audit
 from tiler.workflow.run import run
 
@@ -119,11 +120,13 @@ def test_edits_of_many_clients_with_kills_end_in_the_bytes_of_one_run(small_run:
             thread.start()
         for thread in threads:
             thread.join()
-        journal = ask(place[0], "/edits")[1] if place[0] else []
+        while not place[0] or ask(place[0], "/city")[1]["state"] != REST:
+            time.sleep(0.1)
+        journal = ask(place[0], "/edits")[1]
     done = sorted((edit for client in clients for edit in client.done), key=lambda edit: edit[0])
     assert [number for number, _, _ in done] == list(range(1, len(done) + 1))  # told, each once, and none lost
     assert len(done) + sum(client.refused for client in clients) == CLIENTS * EDITS
-    assert not journal or [edit["number"] for edit in journal] == [number for number, _, _ in done]
+    assert [edit["number"] for edit in journal] == [number for number, _, _ in done]
     for _, name, shape in done:
         shapes.pop(name, None)
         if shape is not None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import shapely
 
@@ -19,10 +20,15 @@ from tiler.config.config import make_config
 from tiler.editing.edit import held_city
 from tiler.editing.requests import ConflictError
 from tiler.export.export import export_run
+from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.serving.bodies import MOST_BYTES, make_asked
 from tiler.serving.edit_queue import REST, EditQueue
 from tiler.serving.serve import FOLDER, serve_city
+from tiler.store.out_folder import CITY_MODEL
+from tiler.tiles3d.globe import Globe, geocentric
+from tiler.tiles3d.slices import cut_pieces, make_slices
 from tiler.tiles3d.update import TILES
+from tiler.workflow.audit import Audit, Damage
 from tiler.workflow.run import run
 
 TOKEN = "0123456789abcdef"
@@ -102,6 +108,9 @@ SQUARE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 9], [0, 9], [0
 @pytest.mark.parametrize(
     ("body", "headers", "status", "words"),
     [
+        ({"action": "add", "building": "x", "glb": "%"}, {}, 422, "not in base64"),
+        ({"action": "add", "building": "x", "glb": "Z2xURg==", "position": [0, 0, 0]}, {}, 422, "is no GLB file"),
+        ({"action": "remove", "building": "x", "base": 99}, {}, 422, "base 99: the last edit is number"),
         ({"action": "remove", "building": "x"}, {"Content_Type": "text/plain"}, 415, "application/json expected"),
         ({"action": "remove", "building": "x"}, {"Origin": "http://evil.example"}, 403, "other origins"),
         ({"action": "remove", "building": "x"}, {"Host": "evil.example"}, 403, "127.0.0.1 or localhost"),
@@ -132,6 +141,25 @@ def test_the_page_and_the_tiles_are_there(url: str) -> None:
     assert ask(url, "/tiles/tileset.json")[0] == 200
     assert ask(url, "/edits", method="DELETE")[0] == 405
     assert ask(url, "/tiles/%2e%2e/%2e%2e/run.json")[0] == 403
+
+
+@pytest.mark.parametrize("beside", [-9.0, 9.0])  # a seam, which leaves the box of its tile
+def test_a_section_has_the_cells_of_an_upright_slice(beside: float, url: str, city: Path) -> None:
+    xmin, ymin, xmax, ymax = ask(url, "/city")[1]["bounds"]
+    (seam,) = {tile["box"][2] for tile in json.loads((city / "run.json").read_text())["tiles"].values()} - {xmax}
+    line = (seam + beside, ymin + 5, seam + beside, ymax - 5)
+    globe = Globe(ask(url, "/city")[1]["crs"], (xmin, ymin, xmax, ymax))
+    ends = geocentric(globe.geographic(np.array([[*line[:2], 0.0], [*line[2:], 0.0]]))).tolist()
+    query = "&".join(f"{name}={','.join(map(repr, end))}" for name, end in zip(("from", "to"), ends, strict=True))
+    status, data = ask(url, f"/section?{query}")
+    rows = np.frombuffer(data, "<f4", offset=24).reshape(-1, 10)
+    expected = np.concatenate([*cut_pieces(open_pieces(city), make_slices([], [",".join(map(repr, line))]))])
+    assert (status, len(rows)) == (200, len(expected))
+    np.testing.assert_allclose(rows[:, 9], expected[:, 9], rtol=1e-6)
+    places = geocentric(globe.geographic(expected[:, :9].reshape(-1, 3)))
+    np.testing.assert_allclose(np.frombuffer(data, "<f8", 3) + rows[:, :9].reshape(-1, 3), places, atol=1e-3)
+    assert ask(url, "/section?from=1,2&to=1,2,3")[0] == 422
+    assert ask(url, "/section?from=1,2,3&to=4e6,2,3")[0] == 422
 
 
 def test_others_need_the_token(small_run: Path, tmp_path: Path) -> None:
@@ -172,9 +200,13 @@ def test_edits_that_wait_are_one_transaction_and_end_in_the_bytes_of_one_run(
         {"action": "remove", "building": other} | {"id": "kept"},
         {"action": "remove", "building": "nobody"},
     ]
-    after: list[int] = []
+    after: list[tuple[int, bool, list[Damage]]] = []
+
+    def look(number: int) -> None:
+        after.append((number, (folder / CITY_MODEL).exists(), [*Audit(folder)]))
+
     with held_city(folder) as city:
-        queue = EditQueue(city, after.append)
+        queue = EditQueue(city, look)
         waiting = [queue.put(make_asked(body, city)) for body in bodies]
         assert queue.put(make_asked(bodies[2], city)) is waiting[2]
         with queue:
@@ -185,10 +217,24 @@ def test_edits_that_wait_are_one_transaction_and_end_in_the_bytes_of_one_run(
     done = [one for one in found if not isinstance(one, BaseException)]
     assert [one.edit.number for one in done] == [1, 2, 3]
     assert done[0].record is done[1].record is done[2].record
-    assert after == [3]
+    assert after == [(3, False, [])]  # the files of the city models come later
     del shapes[gone], shapes[other]
     shapes[moved] = shape.buffer(-0.4)
     final = write(tmp_path / "final.gpkg", *shapes.values(), ids=list(shapes))
     given = json.loads((folder / "run.json").read_text())["parameters"]
     run(make_config(given | {"footprints": str(final), "out": str(tmp_path / "whole")}))
     assert mesh_of(folder) == mesh_of(tmp_path / "whole")
+
+
+@pytest.mark.long
+def test_workers_of_the_service_make_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
+    (house, shape), *_ = read_input(small_run).items()
+    body = {"action": "replace", "building": house, "footprint": footprint(shape.buffer(-0.4))}
+    cities = [shutil.copytree(small_run, tmp_path / name) for name in ("alone", "workers")]
+    for city, workers in zip(cities, (0, 2), strict=True):
+        with serve_city(city, "127.0.0.1:0", workers=workers) as url:
+            assert ask(url, "/edits", body)[0] == 201
+        # The server has ended, and has written the city models before.
+        assert not [*Audit(city)]
+    assert mesh_of(cities[0]) == mesh_of(cities[1])
+    assert read_all(cities[0] / FOLDER / TILES) == read_all(cities[1] / FOLDER / TILES)

@@ -1,7 +1,7 @@
 // What the page takes of three.js and 3DTilesRendererJS; build.sh makes libraries.js of it.
 export {
   Box3, BufferAttribute, BufferGeometry, Color, DirectionalLight, HemisphereLight, Line, LineBasicMaterial,
-  MeshLambertMaterial, PerspectiveCamera, Raycaster, Scene, Sphere, Vector2, Vector3, WebGLRenderer,
+  Mesh, MeshLambertMaterial, PerspectiveCamera, Plane, Raycaster, Scene, Sphere, Vector2, Vector3, WebGLRenderer,
 } from "three";
 export { MapControls } from "three/examples/jsm/controls/MapControls.js";
 export { TilesRenderer } from "3d-tiles-renderer/three";

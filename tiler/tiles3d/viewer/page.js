@@ -1,7 +1,7 @@
 // The city of a folder of 3D Tiles: streamed, coloured, picked and measured.
 import {
   Box3, BufferAttribute, BufferGeometry, Color, DirectionalLight, GLTFExtensionsPlugin, HemisphereLight, ImplicitTilingPlugin,
-  Line, LineBasicMaterial, MapControls, MeshLambertMaterial, PerspectiveCamera, Raycaster, ReorientationPlugin, Scene, Sphere,
+  Line, LineBasicMaterial, MapControls, Mesh, MeshLambertMaterial, PerspectiveCamera, Plane, Raycaster, ReorientationPlugin, Scene, Sphere,
   TilesRenderer, Vector2, Vector3, WebGLRenderer,
 } from "./libraries.js";
 
@@ -24,11 +24,11 @@ const controls = new MapControls(camera, canvas);
 controls.maxPolarAngle = 1.5;
 controls.minDistance = 5;
 
-const state = { mode: "surface", picked: null, measuring: false, places: [], bytes: 0, frames: [], first: null, failed: [], classes: new Map(), swaps: 0 };
+const state = { mode: "surface", picked: null, measuring: false, cutting: false, places: [], bytes: 0, frames: [], first: null, failed: [], classes: new Map(), swaps: 0 };
 const meshes = new Set();
 let dirty = true;
 let city = null; // the sphere around the first content
-window.citystitch = { get tiles() { return tiles; }, state, camera, controls, meshes };
+window.citystitch = { get tiles() { return tiles; }, state, camera, controls, meshes, get section() { return section; } };
 new PerformanceObserver((list) => {
   for (const entry of list.getEntries()) if (entry.name.includes("/tiles/")) state.bytes += entry.encodedBodySize;
 }).observe({ type: "resource", buffered: true });
@@ -149,12 +149,14 @@ function swapTiles() {
     const mesh = [...meshes].find((one) => one.userData.own.rows.some((row) => row.id === state.picked));
     if (mesh) showFeature(mesh, mesh.userData.own.rows.find((row) => row.id === state.picked)); else closePanel();
   }
+  if (section.ends) cut(section.ends);
   paintAll();
 }
 let version = null; // of the tiles, as the server tells it
 async function follow() {
   try {
-    const found = (await fetch("tiles/tileset.json", { method: "HEAD", cache: "no-store" })).headers.get("ETag");
+    const { headers } = await fetch("tiles/tileset.json", { method: "HEAD", cache: "no-store" }), found = headers.get("ETag");
+    get("section").hidden = !headers.get("Citystitch-Section");
     if (version && found && found !== version) replaceTiles();
     version = found ?? version;
   } catch { /* the server is away: it may come back */ }
@@ -185,7 +187,7 @@ function hitAt(clientX, clientY) {
 
 function pick(clientX, clientY) {
   const hit = hitAt(clientX, clientY);
-  if (state.measuring) return hit && measure(hit.point);
+  if (state.measuring || state.cutting) return hit && measure(hit.point);
   const row = hit && hit.object.userData.own.rows[hit.object.geometry.getAttribute("_feature_id_0").getX(hit.face.a)];
   state.picked = row && row.id ? row.id : null;
   get("panel").hidden = !row;
@@ -215,19 +217,79 @@ function measure(point) {
   line.geometry.dispose();
   line.geometry = new BufferGeometry().setFromPoints(state.places);
   const [a, b] = state.places;
-  get("length").textContent = b
+  if (state.cutting) {
+    get("length").textContent = b ? "" : "now the other end of the section";
+    if (b) cut([a, b].map((one) => one.clone().applyMatrix4(tiles.group.matrixWorld.clone().invert())));
+  } else get("length").textContent = b
     ? `${a.distanceTo(b).toFixed(2)} m; in plan ${Math.hypot(b.x - a.x, b.z - a.z).toFixed(2)} m, up ${(b.y - a.y).toFixed(2)} m`
     : "now the second place";
   dirty = true;
 }
 function setMeasuring(on) {
   state.measuring = on;
+  state.cutting = false;
   get("measure").setAttribute("aria-pressed", on);
+  get("section").setAttribute("aria-pressed", Boolean(section.ends));
   state.places = [];
   line.geometry.dispose();
   line.geometry = new BufferGeometry();
   get("length").textContent = on ? "the first place" : "";
   dirty = true;
+}
+
+// The section through the volume mesh: cells that the server has cut, coloured by quality; the city before it is hidden.
+const section = { ends: null, place: null, across: null, plane: new Plane(), meshes: [] };
+function setCutting(on) {
+  setMeasuring(false);
+  endSection();
+  state.cutting = on;
+  get("section").setAttribute("aria-pressed", on);
+  get("length").textContent = on ? "one end of the section" : "";
+}
+function endSection() {
+  for (const mesh of section.meshes) { scene.remove(mesh); mesh.geometry.dispose(); mesh.material.dispose(); }
+  section.ends = null;
+  section.meshes = [];
+  renderer.clippingPlanes = [];
+  dirty = true;
+}
+async function cut(ends) {
+  endSection();
+  const reply = await fetch(`section?${new URLSearchParams({ from: ends[0].toArray(), to: ends[1].toArray() })}`);
+  if (!reply.ok) { get("length").textContent = (await reply.json()).error; return; }
+  const data = await reply.arrayBuffer(), rows = new Float32Array(data, 24), n = rows.length / 10;
+  const places = new Float32Array(9 * n), colours = new Float32Array(9 * n), seen = new Map();
+  for (let k = 0; k < n; k++) {
+    const quality = rows[10 * k + 9];
+    if (!seen.has(quality)) seen.set(quality, blend(RAMPS.quality, quality).toArray());
+    places.set(rows.subarray(10 * k, 10 * k + 9), 9 * k);
+    for (let corner = 0; corner < 3; corner++) colours.set(seen.get(quality), 9 * k + 3 * corner);
+  }
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(places, 3));
+  geometry.setAttribute("color", new BufferAttribute(colours, 3));
+  geometry.computeVertexNormals();
+  const look = { emissive: 0xffffff, emissiveIntensity: 0.15, side: 2 };
+  section.meshes = [new MeshLambertMaterial({ vertexColors: true, ...look }), new MeshLambertMaterial({ color: 0x202020, wireframe: true })].map((material) => new Mesh(geometry, material));
+  const frame = tiles.group.matrixWorld, place = new Vector3(...new Float64Array(data, 0, 3)).applyMatrix4(frame);
+  for (const mesh of section.meshes) {
+    mesh.matrixAutoUpdate = false;
+    mesh.matrix.copy(frame).setPosition(place);
+    scene.add(mesh);
+  }
+  const [a, b] = ends.map((one) => one.clone().applyMatrix4(frame));
+  Object.assign(section, { ends, place: a, across: new Vector3(b.z - a.z, 0, a.x - b.x).normalize() });
+  renderer.clippingPlanes = [section.plane];
+  get("length").textContent = `${seen.size} cells of the section; colours: radius ratio, 1 (dark blue) to 0 (red)`;
+  state.measuring = state.cutting = false;
+  get("section").setAttribute("aria-pressed", true);
+  dirty = true;
+}
+// What lies on the side of the camera is hidden, but for a hand's breadth before the section.
+function turnSection() {
+  section.plane.setFromNormalAndCoplanarPoint(section.across, section.place);
+  if (section.plane.distanceToPoint(camera.position) > 0) section.plane.negate();
+  section.plane.constant += 0.1;
 }
 
 function orbit(turn, tilt, scale) {
@@ -253,6 +315,7 @@ canvas.addEventListener("pointerup", (event) => {
 });
 get("mode").addEventListener("change", (event) => { state.mode = event.target.value; paintAll(); });
 get("measure").addEventListener("click", () => setMeasuring(!state.measuring));
+get("section").addEventListener("click", () => setCutting(get("section").getAttribute("aria-pressed") !== "true"));
 get("home").addEventListener("click", showAll);
 function closePanel() { get("panel").hidden = true; state.picked = null; paintAll(); }
 get("close").addEventListener("click", closePanel);
@@ -260,7 +323,8 @@ const KEYS = {
   ArrowLeft: () => shift(-1, 0), ArrowRight: () => shift(1, 0), ArrowUp: () => shift(0, 1), ArrowDown: () => shift(0, -1),
   "+": () => orbit(0, 0, 0.8), "=": () => orbit(0, 0, 0.8), "-": () => orbit(0, 0, 1.25), q: () => orbit(-0.15, 0, 1), e: () => orbit(0.15, 0, 1),
   PageUp: () => orbit(0, -0.1, 1), PageDown: () => orbit(0, 0.1, 1), 0: showAll, m: () => setMeasuring(!state.measuring),
-  Enter: () => pick(canvas.clientWidth / 2, canvas.clientHeight / 2), Escape: () => { setMeasuring(false); closePanel(); },
+  s: () => { if (!get("section").hidden) get("section").click(); },
+  Enter: () => pick(canvas.clientWidth / 2, canvas.clientHeight / 2), Escape: () => { setCutting(false); closePanel(); },
   c: () => { const select = get("mode"); select.selectedIndex = (select.selectedIndex + 1) % select.length; select.dispatchEvent(new Event("change")); },
 };
 window.addEventListener("keydown", (event) => {
@@ -300,6 +364,7 @@ renderer.setAnimationLoop((now) => {
   }
   if (!dirty) { before = null; return; }
   dirty = false;
+  if (section.ends) turnSection();
   renderer.render(scene, camera);
   if (before !== null) state.frames = [...state.frames.slice(-29), now - before];
   before = now;
