@@ -36,6 +36,7 @@ def measure(
     ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     environment = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    environment["PYTHONDONTWRITEBYTECODE"] = ""  # modules are compiled once, as where they are installed
     process = subprocess.Popen([*command, *words], stdout=subprocess.DEVNULL, env=environment, cwd=folder)
     peak, ended = [0], threading.Event()
 

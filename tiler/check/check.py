@@ -23,6 +23,7 @@ from tiler.citymodels.building_index import BuildingIndex, copy_vertices, index_
 from tiler.executors.in_order import check_workers, map_in_order
 from tiler.mesh_files.mesh_parts import report_parts
 from tiler.mesh_files.vtk_files import read_piece_paths
+from tiler.store.kept import IN_PIECES, need
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.run_folder import PARTS, RunRecord, read_crs, read_run_record
 
@@ -110,6 +111,7 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
     for a neighbour on the frontier (`stitch.pieces.frontier`), besides some 100 bytes a building and 500 a piece.
     """
     check_workers(workers)
+    need(directory, IN_PIECES)
     record = read_run_record(directory / RUN_RECORD)
     if workers:
         from tiler.executors.dask_settings import start_fork_server

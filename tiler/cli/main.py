@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import EXPORT_OPTION, SYNTH_BUILDINGS, Handler, build_parser
-from tiler.config.config import Config, make_config
+from tiler.config.config import KEPT, Config, make_config
 from tiler.config.config_file import annotated_defaults, with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
 from tiler.mesh_files.run_files import refuse_strangers
@@ -161,6 +161,8 @@ def _run_config(
 
     if report:
         refuse_bucket(config.out, "--report")
+        if config.keep != KEPT[0]:
+            raise ConfigError(f"--report: reads store and pieces, --keep {config.keep} leaves one; give either")
     out = place(config.out)
     watchers: list[Watcher] = []
     if log is not None:

@@ -34,6 +34,7 @@ PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is g
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
 LEAST_SIZE = 0.1  # m; of edges
 CLEARANCE_OF_MODELS = 0.5  # m; their walls are exact: moved by more, a court comes under a roof beside it
+KEPT = ("both", "store", "pieces")  # what may stay in the folder of a run that is done
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
@@ -405,6 +406,10 @@ class Config:
         False, "run", "accept a mesh without buildings although footprints were given; else the run fails"
     )
     out: str = _parameter("out", "run", "folder for the results, or s3://BUCKET/NAME")
+    keep: str = _parameter(
+        KEPT[0], "run", "what stays in the folder of a run that is done: store, the results of all steps, from "
+        "which the mesh is written again; pieces, of the mesh, with the terrain for check; or both", choices=KEPT,
+    )  # fmt: skip
     overwrite: bool = _parameter(
         False, "run", "remove the results of an earlier run in that folder, and start anew"
     )

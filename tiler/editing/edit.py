@@ -27,6 +27,7 @@ from tiler.objects.places import refuse_bucket
 from tiler.store.atomic import replacing_folder
 from tiler.store.edit_journal import Box, Edit, edit_path, read_journal, write_edit
 from tiler.store.folder_lock import is_held, only_run
+from tiler.store.kept import IN_PIECES, IN_STORE, need
 from tiler.store.out_folder import CITY_MODEL, CONFIG, FULL_CITY_MODEL, RUN_RECORD
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.audit import read_sealed_record
@@ -77,6 +78,7 @@ def held_city(directory: Path, workers: int = 0, say: Callable[[str], None] = sa
         If it holds no finished run, another process has it, or it cannot be edited.
     """
     refuse_bucket(directory, "an edit")
+    need(directory, IN_STORE, IN_PIECES)
     with only_run(_finished(directory), say):
         finish_interrupted(directory, say)
         record, config = _read_run(directory, workers)

@@ -115,6 +115,8 @@ def export_run(
     OutputError
         If the file cannot be written.
     """
+    from tiler.store.kept import IN_PIECES, need  # with numpy, which the parser does without
+
     kind = load_format(name)
     for option in options:
         if option not in kind.options:
@@ -128,6 +130,7 @@ def export_run(
     if not output.name.endswith(kind.suffix):
         raise ConfigError(f"{output}: a file of format {name} ends with {kind.suffix}; give another --output")
     given = dict(options)
+    need(directory, IN_PIECES)
     files = find_files(directory)
     for target in (output, output.with_suffix(kind.companion)) if kind.companion else (output,):
         _check_target(target, files, overwrite=overwrite)

@@ -98,9 +98,15 @@ def next_commands(out: Place) -> Sequence[Sequence[str]]:
     folder = str(out)
     if in_bucket(out):
         return (("citystitch", "fetch", folder, "DIR"),)
+    from tiler.store.kept import IN_STORE, WHOLE, find_kept  # with numpy, which the parser does without
+    from tiler.store.out_folder import CONFIG
+
+    keep = find_kept(out)
+    if keep == IN_STORE:
+        return (("citystitch", "run", str(out / CONFIG), "--keep", WHOLE),)
     return (
         ("citystitch", "check", folder),
-        ("citystitch", "report", folder),
+        *((("citystitch", "report", folder),) if keep == WHOLE else ()),
         ("citystitch", "render", folder, "-o", "city.png"),
         ("citystitch", "export", folder, "--format", "openfoam", "-o", "case"),
     )

@@ -1,6 +1,6 @@
 """What a picture of a run is made from: its boundary and its volume cut open, gathered piece by piece."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -259,6 +259,16 @@ def load_city(
         quality=found.quality,
         step=step,
     )
+
+
+def take_near(city: City, within: float) -> City:
+    """Take the facets in a square around the origin, half a side given (m); all of them where it has none."""
+    near = (np.abs(city.points[city.facets, :2]) < within).all(axis=(1, 2))
+    if not near.any():
+        return city
+    points, facets = sew(city.points, city.facets[near])
+    rows = {name: getattr(city, name)[near] for name in ("marker", "building", "piece")}
+    return replace(city, points=points, facets=facets, **rows)
 
 
 def load_levels(directory: Path, city: City) -> NDArray[np.int8]:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
 from pipeline.data.mesh import Marker
-from tiler.pictures.picture_data import City, find_middle, load_air, load_city, load_levels
+from tiler.pictures.picture_data import City, find_middle, load_air, load_city, load_levels, take_near
 from tiler.pictures.picture_parts import add_air, add_city, add_sizes, plan_edges
 from tiler.pictures.plain_picture import PlainPlotter, has_graphics
 from tiler.store.atomic import replacing
+from tiler.store.kept import IN_PIECES, IN_STORE, need
 
 # Compass direction that the camera stands in, and its angle over the horizon (degrees).
 VIEW = (215.0, 35.0)
@@ -42,7 +43,7 @@ OCCLUSION_RADIUS = 20.0
 MOST_SHADED = 10_000.0  # m; in a larger region a house is below a pixel, and the shade is of the terrain's slope
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
-SHADE = 32  # places around each pixel drawn that may darken it
+SHADE = 16  # places around each pixel drawn that may darken it
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
 LEAST_TRIANGLE = 3.0  # pixels that the middle triangle's edges need in the picture of sizes for lines to be drawn
 NEED_GRAPHICS = ("quality", "sizes")  # pictures with a legend
@@ -152,6 +153,7 @@ def render_run(
     columns, rows = size or SIZES[what]
     if columns < 2 or rows < 2:
         raise ValueError(f"size {columns} x {rows} must be at least 2 x 2")
+    need(directory, *{"citymodel": [IN_STORE], "levels": [IN_STORE, IN_PIECES]}.get(what, [IN_PIECES]))
     with ThreadPoolExecutor(1) as pool:  # which asks another process, while pyvista is imported here
         asked = pool.submit(has_graphics)
         need_pictures()
@@ -210,6 +212,8 @@ def draw_city(
     uint8, (height, width, 3)
         The picture.
     """
+    if close:
+        city = take_near(city, 2 * CLOSE)  # what lies farther off is beside the picture
     if not has_graphics():
         return _draw_plainly(city, size, colours=colours, edges=edges, air=air)
     with _plotter(size) as plotter:
@@ -230,7 +234,7 @@ def draw_city(
         plotter.camera.position, plotter.camera.focal_point = _aim(shown, size, cut=air is not None)
         plotter.camera.up = (0.0, 0.0, 1.0)
         plotter.reset_camera_clipping_range()
-        if extent < MOST_SHADED:
+        if extent < MOST_SHADED and colours != "quality":  # whose colours the legend gives
             plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=SHADE)
         return _shoot(plotter)
 

@@ -35,22 +35,25 @@ def describe_pictures(directory: Path) -> Iterator[str]:
     except ConfigError as error:
         yield paragraph(f"There are no pictures: {error}.", "bad")
         return
-    city = load_city(directory, quality=True)
-    coarse = f" Vertices within {city.step:g} m are drawn as one." if city.step else ""
+    middle = find_middle(directory)
+    part = load_city(directory, only=middle, quality=True)
+    city = part if middle is None else load_city(directory)
+    coarse, some = (
+        f" Vertices within {one.step:g} m are drawn as one." if one.step else "" for one in (city, part)
+    )
+    where = "" if middle is None else " in the middle of the region"
     yield _embed(
         draw_city(city, SIZE),
         f"The boundary from the south-west: ground by height, roofs by height above ground.{coarse}",
     )
-    middle = find_middle(directory)
-    part = city if middle is None and not city.step else load_city(directory, only=middle)
     air = load_air(directory, part.origin, only=frozenset(part.names), within=2 * CLOSE)
     yield _embed(
         draw_city(part, SIZE, air=air, close=True),
         "The mesh in the middle of the region, cut open from west to east.",
     )
     yield _embed(
-        draw_city(city, SIZE, colours="quality"),
-        f"Radius ratio of the cell behind each facet of the boundary, the darker the worse.{coarse}",
+        draw_city(part, SIZE, colours="quality"),
+        f"Radius ratio of the cell behind each facet of the boundary{where}, the darker the worse.{some}",
     )
 
 

@@ -12,6 +12,7 @@ from tiler.report.roof_truth import compare_with_truth, describe_truth
 from tiler.report.samples import measure_samples
 from tiler.report.timeline import read_timeline
 from tiler.store.atomic import replacing
+from tiler.store.kept import IN_PIECES, IN_STORE, need
 from tiler.store.out_folder import EVENTS, REPORT, RUN_RECORD, STORE
 from tiler.store.run_folder import WRONG_FIELD, broken_field
 from tiler.store.store import Store
@@ -47,6 +48,7 @@ def write_report(directory: Path, *, truth: Path | None = None) -> Path:
     """
     if not directory.is_dir():
         raise ConfigError(f"{directory}: no such folder; give the folder of a run")
+    need(directory, IN_STORE, IN_PIECES)
     facts = read_run_facts(directory)
     try:
         page = _fill(directory, facts, truth)

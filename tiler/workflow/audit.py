@@ -14,6 +14,7 @@ from tiler.store.atomic import replacing
 from tiler.store.checksums import FILES, GONE, TAIL, find_change, find_file_damage, is_sealed, seal_file
 from tiler.store.edit_journal import JOURNAL, read_journal
 from tiler.store.folder_lock import is_held
+from tiler.store.kept import WHOLE, is_kept
 from tiler.store.out_folder import INDEXES, MANIFEST_PATH, PIECES, RUN_RECORD, STORE
 from tiler.store.store import SUFFIX, Store
 
@@ -34,15 +35,15 @@ class Entry:
     files: Mapping[str, Any]
 
 
-def write_manifest(path: Path, records: Records, files: Mapping[str, Any]) -> None:
-    """Write the manifest: a line of JSON a result, by stage and name, at last the files that none states.
+def write_manifest(path: Path, records: Records, files: Mapping[str, Any], keep: str = WHOLE) -> None:
+    """Write the manifest: a line of JSON a result that is kept, by stage and name, at last the files of none.
 
     These are as `tiler.store.checksums.state_files` gives them. No clock and no place is in the manifest: the same
     input gives the same bytes. It appears whole or not at all, and ends as `seal_file` leaves it.
     """
     with replacing(path, durable=True) as part:
         with part.open("wb") as file:
-            for stage, name in sorted(records):
+            for stage, name in sorted(item for item in records if is_kept(item[0], keep)):
                 key, _ = records.made(stage, name)
                 entry = [stage, name, key, records.digest(stage, name), records.files(stage, name)]
                 file.write(json.dumps(entry, sort_keys=True).encode() + b"\n")

@@ -39,6 +39,7 @@ from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.checksums import seal, state_files
 from tiler.store.edit_journal import Edits, add_up, read_journal
 from tiler.store.folder_lock import only_run
+from tiler.store.kept import IN_STORE, remove_dropped
 from tiler.store.out_folder import (
     INDEXES,
     MANIFEST_PATH,
@@ -307,9 +308,10 @@ def _mesh_region(
     remove_strangers(out, tiles)
     write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile}.vtu" for tile in tiles])
     write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile}.vtp" for tile in tiles])
-    indexes = state_files(out, [out / name for name in INDEXES])
-    write_manifest(out / MANIFEST_PATH, engine.records, indexes)
+    indexes = {} if config.keep == IN_STORE else state_files(out, [out / name for name in INDEXES])
+    write_manifest(out / MANIFEST_PATH, engine.records, indexes, config.keep)
     summary = summarise_run(engine, plan, config, rounds, missing, dict(damage) | remade)
+    remove_dropped(out, {stage for stage, _ in engine.records}, config.keep)
     return summary | {"driver_memory_bytes": peak_memory()}
 
 

@@ -20,6 +20,7 @@ from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
 from tiler.store.edit_journal import add_up, read_journal
 from tiler.store.folder_lock import only_run
+from tiler.store.kept import IN_STORE, need
 from tiler.store.out_folder import PIECES, STORE
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.failed_tiles import config_alone
@@ -53,6 +54,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
     if config.water_points:
         raise ConfigError("--only with --water-points: water at the sides of its part of the region would differ")
     refuse_bucket(config.out, "--only")
+    need(Path(config.out), IN_STORE)
     config, whole = resolve_shift(config, make_plan(config, say_nothing), say_nothing)
     domain, tallest = domain_of_run(config)
     shift = shift_of_run(config) if config.align and config.footprints else None
