@@ -24,6 +24,7 @@ from pipeline.architecture.roof_sides import RoofSide, count_walls, list_sides, 
 from pipeline.architecture.rules import Distribution
 from pipeline.architecture.surfaces import GROUND, Surface, to_town
 
+CORNER = 1.5  # m, of alcoves from the corner of a courtyard
 MARGIN = 0.3  # m between what stands on a roof or lies in a wall, and from its border
 SILL, THRESHOLD = 0.9, 0.05  # m above the floor: windows, and the door
 LEAST_RISE = 0.3  # m; a roof that rises less is flat
@@ -187,6 +188,8 @@ def _draw_parts(dice: _Dice, house: House, lot: Lot) -> tuple[BuildingPart, ...]
     deep = 1.5 if lot.party else min(2.5, math.sqrt(max(room**2 - (wide / 2 + 2.0) ** 2, 0.0)) - house.width / 2)
     if alcove and deep >= 1.0 and 2 not in lot.party and not house.plan:
         along = dice.between(0.5, house.length - wide - 0.5) if lot.party else round((house.length - wide) / 2, 3)
+        if lot.corner:  # clear of alcoves of the next side
+            along = min(max(along, CORNER), round(house.length - wide - CORNER, 3))
         parts.append(BuildingPart("alcove", 2, along, wide, round(deep, 3), height))
     return tuple(parts)
 

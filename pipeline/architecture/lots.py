@@ -30,6 +30,8 @@ class Lot:
         Walls that its house shares with neighbours: it fills the lot between them.
     use : str
         ``"house"``, ``"street"`` or ``"court"``.
+    corner : bool
+        Whether houses of another side of its block stand beside its back.
     """
 
     i: int
@@ -40,6 +42,7 @@ class Lot:
     rotation: float
     party: tuple[int, ...] = ()
     use: str = "house"
+    corner: bool = False
 
 
 def list_lots(
@@ -69,7 +72,7 @@ def list_lots(
     if placement not in PLACEMENTS or not size > 0:
         raise ValueError(f"placement {placement!r}, lots of {size} m; placements are {', '.join(PLACEMENTS)}")
     west, south, east, north = bounds
-    step_y = depth + _STREET if placement == "rows" else size
+    _, step_y = lot_steps(placement, size, depth)
     for j in range(math.floor(south / step_y) - 1, math.ceil(north / step_y) + 1):
         for i in range(math.floor(west / size) - 1, math.ceil(east / size) + 1):
             lot = _make_lot(i, j, placement, size, step_y, seed)
@@ -77,12 +80,17 @@ def list_lots(
                 yield lot
 
 
+def lot_steps(placement: str, size: float, depth: float) -> tuple[float, float]:
+    """Give how far lots are from each other eastwards and northwards (m), as of `list_lots`."""
+    return size, depth + _STREET if placement == "rows" else size
+
+
 def list_corners(
     bounds: tuple[float, float, float, float], placement: str, size: float, *, depth: float = 0.0
 ) -> Iterator[tuple[int, int, float, float]]:
     """List the lower left corners of lots that lie in a box, as `list_lots`: numbers of the lot, and the place."""
     west, south, east, north = bounds
-    step_y = depth + _STREET if placement == "rows" else size
+    _, step_y = lot_steps(placement, size, depth)
     for j in range(math.ceil(south / step_y), math.ceil(north / step_y)):
         for i in range(math.ceil(west / size), math.ceil(east / size)):
             if placement != "blocks" or all(
@@ -122,7 +130,8 @@ def _block_lot(i: int, j: int, size: float) -> Lot:
         # A front to the west has the south on its right side, one to the east on its left.
         right, left = (south, north) if column == 1 else (north, south)
         party = ((3,) if left else ()) + ((1,) if right else ())
-        return Lot(i, j, *centre, size, 270.0 if column == 1 else 90.0, party)
+        corner = row in (2, top - 1)
+        return Lot(i, j, *centre, size, 270.0 if column == 1 else 90.0, party, corner=corner)
     return Lot(i, j, *centre, size, 0.0, use="court")
 
 

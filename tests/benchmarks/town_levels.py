@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyvista as pv
 import triangle
+from PIL import Image
 
 from pipeline.architecture.draw import draw_house
 from pipeline.architecture.levels import LEVELS, make_level
@@ -64,7 +65,8 @@ def find_house() -> House:
 def show(plotter: pv.Plotter, surfaces: list[Surface], shift: np.ndarray, opacity: float = 1.0) -> None:
     """Add surfaces and their edges."""
     for surface in surfaces:
-        plotter.add_mesh(triangulate(surface).translate(shift), color=COLOURS[surface.kind], opacity=opacity)
+        faces = triangulate(surface).translate(shift)
+        plotter.add_mesh(faces, color=COLOURS[surface.kind], opacity=opacity, ambient=0.45, diffuse=0.65)
         for ring in (surface.border, *surface.holes):
             plotter.add_mesh(pv.lines_from_points(np.array([*ring, ring[0]]) + shift), color="#444444")
 
@@ -75,16 +77,28 @@ def show_house(plotter: pv.Plotter, house: House, level: str, shift: np.ndarray)
         show(plotter, volume.surfaces, shift)
 
 
+def save(plotter: pv.Plotter, path: Path, colours: int) -> None:
+    """Save a picture with few colours."""
+    picture = Image.fromarray(plotter.screenshot())
+    few = picture.quantize(colours, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
+
+
 def draw(path: Path) -> None:
     """Draw the levels in rows of four."""
     house, plotter = find_house(), pv.Plotter(off_screen=True, window_size=(1400, 1120))
     for number, level in enumerate(LEVELS):
-        show_house(plotter, house, level, np.array([24 * (number % 4), 0, -22 * (number // 4)]))
+        shift = np.array([24 * (number % 4), 0, -22 * (number // 4)])
+        show_house(plotter, house, level, shift)
+        place = shift + np.array([house.x - 3, house.y - 6, 0])
+        plotter.add_point_labels(
+            [place], [level], font_size=22, shape=None, show_points=False, always_visible=True
+        )
     plotter.set_background("white")
     plotter.enable_parallel_projection()
     plotter.camera_position = [(85, -125, 48), (38, 0, -33), (0, 0, 1)]
     plotter.camera.parallel_scale = 46
-    plotter.screenshot(path)
+    save(plotter, path, 48)
 
 
 if __name__ == "__main__":

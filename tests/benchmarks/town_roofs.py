@@ -20,7 +20,7 @@ from tiler.stages.citymodel import city_model_stages
 from tiler.workflow.stage_sequence import make_engine, run_city_stages
 
 
-def measure(folder: Path, size: float, density: float, class_errors: float) -> None:
+def measure(folder: Path, size: float, density: float, class_errors: float, tile_size: float) -> None:
     """Scan a town, make its city model, and print a line for each type of roof."""
     town, out = folder / f"town-{density:g}", folder / f"out-{density:g}"
     words = ["--style", "detached", "--size", f"{size:g}", "--seed", "7", "--trees", "0.3", "--workers", "2"]
@@ -28,7 +28,7 @@ def measure(folder: Path, size: float, density: float, class_errors: float) -> N
     if citystitch(["synth", str(town), *words, "--lidar", f"{density:g}", "--levels", "2.2"]):
         raise SystemExit("synth failed")
     inputs = {"pointcloud": [str(town / "tiles")], "footprints": str(town / "footprints.gpkg")}
-    config = make_config({**inputs, "id_attribute": "id", "out": str(out), "workers": 2})
+    config = make_config({**inputs, "id_attribute": "id", "out": str(out), "workers": 2, "tile_size": tile_size})
     out.mkdir(parents=True)
     with local(config.workers) as executor:
         engine = make_engine(config, out, make_plan(config, lambda _: None), executor, OwnStages())
@@ -50,13 +50,14 @@ def main() -> None:
     parser.add_argument("--size", type=float, default=2400.0, help="m; 10,000 houses by default")
     parser.add_argument("--density", type=float, nargs="+", default=[2.0, 8.0, 20.0])
     parser.add_argument("--class-errors", type=float, default=0.01)
+    parser.add_argument("--tile-size", type=float, default=500.0, help="m; memory grows with its square")
     given = parser.parse_args()
     print(
         "| pulses/m² | roof | houses | lost | type % | planes % | angle p50 / p95 | outline | height p50 / RMSE |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     for density in given.density:
-        measure(given.folder, given.size, density, given.class_errors)
+        measure(given.folder, given.size, density, given.class_errors, given.tile_size)
 
 
 if __name__ == "__main__":

@@ -27,8 +27,13 @@ from tests.helpers.tiles import (
 )
 from tiler.check.check_piece import read_piece
 from tiler.check.proofs import Finding, join_findings, make_surface
-from tiler.check.size_proofs import check_sizes_of_zones, prove_sizes_of_zones, zone_finer
-from tiler.check.zone_proofs import check_zones, read_given_blocks
+from tiler.check.zone_proofs import (
+    check_sizes_of_zones,
+    check_zones,
+    prove_sizes_of_zones,
+    read_given_blocks,
+    zone_finer,
+)
 from tiler.citymodels.tables import unpack_buildings
 from tiler.config.config import make_config
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones

@@ -16,9 +16,8 @@ from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proo
 from tiler.check.check_piece import ANY, GROUND, TOP
 from tiler.check.piece_survey import LoadDtm, PieceTask, Survey, load_survey, survey_piece
 from tiler.check.proofs import Fault, Finding, Proof, Vertices
-from tiler.check.size_proofs import prove_sizes_of_zones
 from tiler.check.solid_proofs import check_crs, check_solids
-from tiler.check.zone_proofs import check_zones, read_given_blocks
+from tiler.check.zone_proofs import check_zones, prove_sizes_of_zones, read_given_blocks
 from tiler.citymodels.building_index import BuildingIndex, copy_vertices, index_buildings, open_vertices
 from tiler.executors.in_order import check_workers, map_in_order
 from tiler.mesh_files.mesh_parts import report_parts

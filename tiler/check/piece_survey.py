@@ -16,7 +16,7 @@ from stitch.pieces.frontier import Rim
 from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proofs, wall_proofs
 from tiler.check.check_piece import GROUND, Piece, read_piece, take_vertices
 from tiler.check.proofs import Bounds, Dtm, Fault, Finding, Mask, Vertices
-from tiler.check.size_proofs import check_sizes_of_zones, zone_finer
+from tiler.check.zone_proofs import check_sizes_of_zones, zone_finer
 from tiler.citymodels.building_index import BuildingIndex, open_index
 from tiler.store.out_folder import RUN_RECORD, STORE
 from tiler.store.run_folder import RunRecord, read_run_record

@@ -17,6 +17,8 @@ WHOLE = 64 * 2**20  # bytes of a line; a longer one is no feature of a sequence
 # How many lists of faces lie around a polygon of each type of geometry.
 DEPTH = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
 RELIEF = "TINRelief"
+STOREY = "BuildingStorey"
+AROUND = ("Road", "PlantCover", "SolitaryVegetationObject")  # around buildings
 
 Object = Mapping[str, Any]
 Vertices = NDArray[np.float64]
@@ -134,23 +136,30 @@ def _vertices_of(path: Path, document: dict[str, Any], head: CityJsonHead) -> Ve
     return placed
 
 
-def read_buildings(objects: Object, vertices: Vertices, height: str = "") -> Iterator[ModelBuilding]:
+def read_buildings(
+    objects: Object, vertices: Vertices, height: str = "", *, around: bool = False
+) -> Iterator[ModelBuilding]:
     """Give the buildings among the objects of a document, by id, each with its parts.
 
     `vertices`, float64 (n, 3), are those of the document; `height` is the attribute with the height above ground
     (m), ``""`` for ``measuredHeight``. A part belongs to its first parent; one whose parent is absent is a
-    building by itself. A `Building` without geometry is that of its parts.
+    building by itself. A `Building` without geometry is that of its parts. With `around` there are also storeys,
+    and what lies around buildings: roads, plant cover and trees.
     """
     parts: dict[str, list[str]] = {}
     for name, thing in objects.items():
-        if str(thing.get("type")) == "BuildingPart":
+        if thing.get("type") == "BuildingPart" or (around and thing.get("type") == STOREY):
             known = [parent for parent in thing.get("parents", ()) if parent in objects]
             parts.setdefault(known[0] if known else name, []).append(name)
     for name, thing in objects.items():
         if thing.get("type") == "Building" or (
             thing.get("type") == "BuildingPart" and name in parts.get(name, ())
         ):
-            yield _read_building(name, objects, vertices, parts.get(name, []), height)
+            own = parts.get(name, [])
+            inside = own + [storey for part in own for storey in parts.get(part, []) if around]
+            yield _read_building(name, objects, vertices, inside, height)
+        elif around and thing.get("type") in AROUND:
+            yield _read_building(name, objects, vertices, [], height)
 
 
 def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[str], height: str) -> ModelBuilding:
@@ -166,7 +175,11 @@ def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[s
                 )
     attributes = {owner: objects[owner].get("attributes") or {} for owner in dict.fromkeys([name, *parts])}
     above = _number(attributes[name].get(height or "measuredHeight"))
-    return ModelBuilding(name, tuple(shapes), above, tuple(faults), attributes)
+    kinds = {owner: kind for owner in attributes if (kind := objects[owner]["type"]) in (STOREY, *AROUND)}
+    parents = {
+        owner: next(filter(objects.__contains__, objects[owner]["parents"])) for owner in kinds if owner != name
+    }
+    return ModelBuilding(name, tuple(shapes), above, tuple(faults), attributes, kinds, parents)
 
 
 def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> Shape:

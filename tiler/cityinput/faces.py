@@ -66,8 +66,10 @@ class ModelBuilding:
     faults: tuple[str, ...] = ()  # what could not be read
     # Attributes of the building and of each of its parts, by id; those of a GeoPackage only where asked for.
     attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    # Owners that are installations: the building or part of each, by id.
-    installations: Mapping[str, str] = field(default_factory=dict)
+    # Owners that are neither building nor part: the type of each, by id; a road, say, is an owner alone.
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    # Storeys and installations: the building or part of each, by id.
+    parents: Mapping[str, str] = field(default_factory=dict)
     pictures: Sequence[Picture] = ()  # of faces of kind `PICTURED`, in their order
 
 

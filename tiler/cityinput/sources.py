@@ -44,7 +44,7 @@ def kind_of(path: Path) -> str:
 
 
 def scan_model(
-    path: Path, height: str = "", *, attributes: bool = False
+    path: Path, height: str = "", *, attributes: bool = False, around: bool = False
 ) -> Iterator[str | ModelBuilding | Relief]:
     """Give the names of CRSs, the buildings and the terrain of a city model, in the order of the file.
 
@@ -56,6 +56,8 @@ def scan_model(
         Attribute with the height above ground (m); ``""`` for the format's own.
     attributes : bool
         Whether attributes of a GeoPackage are read too: those of other formats always are.
+    around : bool
+        Whether storeys, roads, plant cover and trees of CityJSON are given too.
 
     Raises
     ------
@@ -78,7 +80,7 @@ def scan_model(
     if head.crs:
         yield head.crs
     for objects, vertices in documents:
-        yield from read_buildings(objects, vertices, height)
+        yield from read_buildings(objects, vertices, height, around=around)
         yield from map(Relief, read_relief(objects, vertices))
 
 
@@ -103,11 +105,12 @@ class _Survey:
                 self.wrong += sign < 0
 
 
-def read_model_header(path: Path, axis_order: str = "") -> CloudHeader:
+def read_model_header(path: Path, axis_order: str = "", *, around: bool = False) -> CloudHeader:
     """Read a city model once for its extent, its CRS and the order of its axes.
 
     `axis_order` is ``"xy"`` for the easting first, ``"yx"`` for the northing first; ``""`` for what the file
-    shows. The bounds of the header have the easting first, and ``swapped`` says whether the file has not.
+    shows. The bounds of the header have the easting first, and ``swapped`` says whether the file has not. They are
+    those of buildings; with `around` also of what `scan_model` gives then.
     InputError if the file cannot be read.
 
     Notes
@@ -117,7 +120,7 @@ def read_model_header(path: Path, axis_order: str = "") -> CloudHeader:
     anything it is that of the name: a URN or a URL of OGC means the order of the register.
     """
     found, name = _Survey(), NamedCrs(None, False, "")
-    for each in scan_model(path):
+    for each in scan_model(path, around=around):
         if isinstance(each, str):
             name = name if name.text else read_crs_name(each)
         elif isinstance(each, ModelBuilding):

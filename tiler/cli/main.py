@@ -10,7 +10,8 @@ import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -28,7 +29,8 @@ from tiler.words.std_streams import guard_streams
 if TYPE_CHECKING:
     from tiler.engine.watcher import Watcher
     from tiler.interface.synth import SynthFiles
-    from tiler.towns.town_tile import Output
+    from tiler.towns.styles import Town
+    from tiler.towns.town import TownFiles
 
 T = TypeVar("T")
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
@@ -313,7 +315,7 @@ def _synth(options: argparse.Namespace) -> int:
 
 
 def _write_town(directory: Path, options: argparse.Namespace) -> None:
-    from tiler.towns.town import CLASS_ERRORS, make_output, open_town, write_faults, write_town
+    from tiler.towns.town import CLASS_ERRORS, make_output, open_town, write_faults, write_houses, write_town
     from tiler.towns.town_tile import ModelOptions
 
     if options.buildings != SYNTH_BUILDINGS or options.roofs != "flat":
@@ -329,9 +331,7 @@ def _write_town(directory: Path, options: argparse.Namespace) -> None:
         directory.mkdir(parents=True, exist_ok=True)
         write_faults(directory / "broken.city.jsonl")
     output = make_output(models, variants, options.degrade, truth=options.lidar > 0, seed=options.seed)
-    if options.parameters or options.footprints:
-        _write_given(directory, options, output)
-        return
+    errors = CLASS_ERRORS if options.class_errors is None else options.class_errors
     town = open_town(
         options.size,
         options.style,
@@ -341,42 +341,44 @@ def _write_town(directory: Path, options: argparse.Namespace) -> None:
         trees=options.trees,
         water=options.water,
     )
-    files = write_town(
-        directory,
-        town,
-        output,
-        density=options.density,
-        lidar=options.lidar,
-        class_errors=CLASS_ERRORS if options.class_errors is None else options.class_errors,
-        workers=options.workers,
-    )
+    scan: dict[str, Any] = {"lidar": options.lidar, "class_errors": errors, "workers": options.workers}
+    if options.parameters or options.footprints:
+        _write_given(directory, options, partial(write_houses, output=output, town=town, **scan), town)
+        return
+    files = write_town(directory, town, output, density=options.density, **scan)
+    say(_houses_line(files))
+
+
+def _houses_line(files: "TownFiles") -> str:
     points = f"{len(files.clouds)} LAZ files in {files.clouds[0].parent}, " if files.clouds else ""
-    say(f"{files.houses} houses: {points}{files.models.name}, {files.footprints.name} and {files.parameters.name}")
+    return (
+        f"{files.houses} houses: {points}{files.models.name}, {files.footprints.name} and {files.parameters.name}"
+    )
 
 
-def _write_given(directory: Path, options: argparse.Namespace, output: "Output") -> None:
+def _write_given(
+    directory: Path, options: argparse.Namespace, write: "Callable[..., TownFiles]", town: "Town"
+) -> None:
     """Make the models of parameters, or of footprints by rules where their attributes say nothing."""
     from tiler.towns.augment import augment, write_augmented
     from tiler.towns.parameter_files import read_json, read_xml
-    from tiler.towns.rule_files import make_file_rules
-    from tiler.towns.styles import STYLES
-    from tiler.towns.town import write_houses
 
     if options.parameters and options.footprints:
         raise ConfigError("--parameters and --footprints do not go together; give one of them")
-    if given := [name for name in ("lidar", "trees", "water", "workers") if getattr(options, name)]:
+    if given := [name for name in ("trees", "water") if getattr(options, name)]:
         raise ConfigError(f"--{given[0]}: goes with towns that are drawn; leave out --parameters and --footprints")
     if options.parameters:
         read = read_xml if options.parameters.suffix == ".xml" else read_json
-        files = write_houses(directory, read(options.parameters), output)
-        say(f"{files.houses} houses: {files.models.name}, {files.footprints.name}")
+        files = write(directory, lambda: read(options.parameters))
+        say(_houses_line(files))
         return
-    rules = make_file_rules(options.rules, STYLES[options.style].preset)
-    found = augment(options.footprints, rules, seed=options.seed)
-    files = write_houses(directory, found.houses, output, crs=found.crs)
+    ground = {"ground": town.ground} if options.lidar else {}
+    found = augment(options.footprints, town.rules, seed=options.seed, **ground)
+    files = write(directory, lambda: found.houses, crs=found.crs)
     write_augmented(directory / "augmented.gpkg", found)
     for what, number in sorted(found.counts.items()):
         say(f"{number} {what}")
+    say(_houses_line(files))
     say(
         f"{len(found.outlines)} footprints in augmented.gpkg, {files.houses} of them houses in {files.models.name}"
     )

@@ -43,7 +43,7 @@ WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 LODS = next(entry.metadata["choices"] for entry in dataclasses.fields(Config) if entry.name == "lod")
 SYNTH_BUILDINGS = 500  # of a city of boxes
 # What `pipeline.architecture` and `tiler.towns` have, without their numpy; a test holds these against theirs.
-TOWN_STYLES = ("boxes", "detached", "grid", "terraces", "blocks", "apartments", "towers", "wings")
+TOWN_STYLES = ("boxes", "detached", "grid", "terraces", "blocks", "apartments", "towers", "wings", "mixed")
 TOWN_WALLS, BLOCK_HEIGHTS = ("walls", "eaves"), ("eaves", "third", "half", "two-thirds", "ridge")
 # What `tiler.generalisation` has, without its imports; a test holds these against the defaults there.
 GENERALISE_NUMBERS = (

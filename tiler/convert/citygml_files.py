@@ -10,6 +10,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from tiler.cityinput.cityjson import STOREY
 from tiler.cityinput.faces import ROOF
 from tiler.cityinput.sources import is_north_first
 from tiler.convert.features import (
@@ -41,6 +42,12 @@ NAMESPACES = {
         ":gml": "http://www.opengis.net/gml/3.2",
         ":xlink": "http://www.w3.org/1999/xlink",
     },
+}
+# What lies around buildings: prefixes of elements, and modules.
+MODULES = {
+    "Road": ("tran", "transportation"),
+    "PlantCover": ("veg", "vegetation"),
+    "SolitaryVegetationObject": ("veg", "vegetation"),
 }
 HEIGHT = "measuredHeight"  # the one attribute that is not generic
 OWN = "_g"  # begins the ids of polygons; those of buildings that begin so get another letter before
@@ -75,23 +82,44 @@ class CityGmlWriter:
         )
 
     def feature(self, feature: Feature) -> str:
-        """Write a building with its parts."""
+        """Write a building with its parts and storeys, or what lies around buildings."""
         places = (feature.vertices * self.step + self.origin)[:, self.order]
-        house, *parts = feature.objects
+        house, *others = feature.objects
+        parts = [one for one in others if one.kind != STOREY]
+        storeys = {one.id: self._storeys(one, others, places) for one in feature.objects}
         role = "buildingPart" if self.new else "consistsOfBuildingPart"
-        inner = "".join(f"<bldg:{role}>{self._thing('BuildingPart', one, places)}</bldg:{role}>" for one in parts)
-        return f"<cityObjectMember>{self._thing('Building', house, places, inner)}</cityObjectMember>\n"
+        inner = "".join(
+            f"<bldg:{role}>{self._thing('bldg:BuildingPart', one, places, storeys[one.id])}</bldg:{role}>"
+            for one in parts
+        )
+        kind = f"{MODULES[house.kind][0]}:{house.kind}" if house.kind in MODULES else "bldg:Building"
+        text = self._thing(kind, house, places, storeys[house.id] + inner)
+        return f"<cityObjectMember>{text}</cityObjectMember>\n"
+
+    def _storeys(self, part: CityObject, others: list[CityObject], places: NDArray[np.float64]) -> str:
+        """Write what is in a building or a part; 2.0 has rooms alone."""
+        role, kind = ("buildingSubdivision", "Storey") if self.new else ("interiorRoom", "Room")
+        own = (one for one in others if one.kind == STOREY and one.parent == part.id)
+        return "".join(f"<bldg:{role}>{self._thing(f'bldg:{kind}', one, places)}</bldg:{role}>" for one in own)
 
     def _thing(self, kind: str, one: CityObject, places: NDArray[np.float64], parts: str = "") -> str:
         name = self._id(one.id)
         text = "" if name == one.id else f"<gml:name>{_text(one.id)}</gml:name>"
         attributes = {key: value for key, value in one.attributes.items() if value is not None}
         self.told["attributes that are null, which CityGML has not"] += len(one.attributes) - len(attributes)
-        height = attributes.get(HEIGHT)
+        if one.kind in MODULES:
+            prefix, module = MODULES[one.kind]
+            uri = f"http://www.opengis.net/citygml/{module}/{self.version}"
+            start = f'<{kind} xmlns:{prefix}="{uri}" gml:id={quoteattr(name)}>'
+        else:
+            start = f"<{kind} gml:id={quoteattr(name)}>"
+        height = attributes.get(HEIGHT) if one.kind.startswith("Building") else None
         above = f"{float(height):g}" if isinstance(height, (int, float)) and height is not True else ""
         if above:
             del attributes[HEIGHT]
         generic = "".join(self._attribute(key, value) for key, value in attributes.items())
+        if one.kind in (STOREY, *MODULES) and not self.new:
+            return f"{start}{text}{generic}{self._plain(kind, one, places)}</{kind}>"
         spaces, surfaces = self._geometries(one, places)
         if self.new:
             tall = (
@@ -106,7 +134,7 @@ class CityGmlWriter:
             low = "".join(value for key, value in spaces.items() if key < 3)
             high = "".join(value for key, value in spaces.items() if key >= 3)
             body = f"{text}{generic}{tall}{low}{surfaces}{high}{parts}"
-        return f"<bldg:{kind} gml:id={quoteattr(name)}>{body}</bldg:{kind}>"
+        return f"{start}{body}</{kind}>"
 
     def _id(self, text: str) -> str:
         """Give an id that XML takes and that no object before had."""
@@ -125,6 +153,25 @@ class CityGmlWriter:
             return f"<genericAttribute><gen:{name}>{inner}</gen:{name}></genericAttribute>"
         name = f"gen:{kind}Attribute"
         return f"<{name} name={quoteattr(_clean(key))}><gen:value>{told}</gen:value></{name}>"
+
+    def _plain(self, kind: str, one: CityObject, places: NDArray[np.float64]) -> str:
+        """Write rooms at level 4 of 2.0, and what lies around buildings at its whole levels, from 1 on."""
+        room = one.kind == STOREY
+        text = ""
+        levels = groupby(sorted(one.geometries, key=lambda g: g.lod), lambda g: 4 if room else int(g.lod) or 1)
+        for level, items in levels:
+            chosen = self._choose(list(items))
+            polygons = [self._polygon(rings, places)[1] for _, rings in chosen.faces]
+            form = "Geometry" if one.kind.startswith("Solitary") else "MultiSurface"
+            inner = _multi(polygons)
+            if room and chosen.closed:
+                form = "Solid"
+                members = "".join(f"<gml:surfaceMember>{polygon}</gml:surfaceMember>" for polygon in polygons)
+                shell = f"<gml:CompositeSurface>{members}</gml:CompositeSurface>"
+                inner = f"<gml:Solid><gml:exterior>{shell}</gml:exterior></gml:Solid>"
+            name = f"{kind.partition(':')[0]}:lod{level}{form}"
+            text += f"<{name}>{inner}</{name}>"
+        return text
 
     def _geometries(self, one: CityObject, places: NDArray[np.float64]) -> tuple[Mapping[int, str], str]:
         """Write geometries by whole level, and the boundary surfaces of all levels."""

@@ -63,8 +63,7 @@ def _objects(feature: Feature, source: ModelSource, first: int = 0) -> dict[str,
     for one in feature.objects:
         kept = [item for item in one.geometries if item.lod < HIGHEST]
         source.told["geometries of level 4, which CityJSON has not"] += len(one.geometries) - len(kept)
-        kind = "Building" if one is house else "BuildingInstallation" if one.parent else "BuildingPart"
-        thing: dict[str, Any] = {"type": kind}
+        thing: dict[str, Any] = {"type": one.kind}
         if one is not house:
             thing["parents"] = [one.parent or house.id]
         if one.id in children:

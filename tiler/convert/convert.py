@@ -32,13 +32,14 @@ class Target:
     # Writes a source to a path, at a level of detail where `one_level`.
     write: Callable[[Path, ModelSource, str], None]
     one_level: bool = False  # whether it holds each building at one level: it is a surface in metres
+    around: bool = False  # whether it holds storeys, roads, plant cover and trees
 
 
 TARGETS: Mapping[str, Target] = {
-    "cityjson": Target((".json",), lambda path, source, _: write_document(path, source)),
-    "cityjsonseq": Target((".jsonl",), lambda path, source, _: write_sequence(path, source)),
-    "citygml2": Target((".gml", ".xml"), lambda path, source, _: write_citygml(path, source, "2.0")),
-    "citygml3": Target((".gml", ".xml"), lambda path, source, _: write_citygml(path, source, "3.0")),
+    "cityjson": Target((".json",), lambda path, source, _: write_document(path, source), around=True),
+    "cityjsonseq": Target((".jsonl",), lambda path, source, _: write_sequence(path, source), around=True),
+    "citygml2": Target((".gml", ".xml"), lambda path, source, _: write_citygml(path, source, "2.0"), around=True),
+    "citygml3": Target((".gml", ".xml"), lambda path, source, _: write_citygml(path, source, "3.0"), around=True),
     "gpkg": Target((".gpkg",), lambda path, source, _: write_gpkg(path, source)),
     "obj": Target((".obj",), write_obj, one_level=True),
     "glb": Target((".glb",), write_glb, one_level=True),
@@ -102,7 +103,7 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
     refuse_output(output, inputs, overwrite=asked.overwrite)
     if asked.tile_size and output.exists() and not _holds_tiles(output):
         raise ConfigError(f"{output}: is no folder of tiles, which would be replaced; give another --output")
-    with open_source(inputs, crs=asked.crs, axis_order=asked.axis_order) as source:
+    with open_source(inputs, crs=asked.crs, axis_order=asked.axis_order, around=target.around) as source:
         if target.one_level and source.in_degrees:
             name = crs_name(source.crs) if source.crs is not None else ""
             raise ConfigError(f"{name} is in degrees, and format {asked.name} in metres; give --crs EPSG:NNNN")
@@ -138,7 +139,7 @@ def _write_tiles(folder: Path, source: ModelSource, asked: Asked, told: Counter[
         tiles = split_source(source, asked.tile_size, Path(waiting))
         told.update(source.told)
         for path in tiles:
-            with open_source([path], axis_order="xy") as own:
+            with open_source([path], axis_order="xy", around=target.around) as own:
                 tile = replace(own, crs=source.crs)  # its name in the sequence may not tell it
                 target.write(folder / f"{path.stem}{target.suffixes[0]}", tile, asked.lod)
                 told.update(tile.told)

@@ -33,8 +33,12 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class CityObject:
-    """A building, a part or, with a `parent`, an installation of one, with its id, attributes and geometries."""
+    """A building, or another thing of some type of CityJSON, with its id, attributes and geometries.
 
+    A `parent` is the building or part of a storey or an installation.
+    """
+
+    kind: str
     id: str
     attributes: dict[str, Any]
     geometries: list[Geometry]
@@ -43,7 +47,7 @@ class CityObject:
 
 @dataclass(frozen=True, eq=False)
 class Feature:
-    """A building, then its parts, on vertices of their own.
+    """A building, then its parts and storeys, on vertices of their own; or a road, a plant cover or a tree.
 
     `vertices`, int64 (n, 3), are each there once, in steps of the source from its lowest corner, rounded down to a
     whole metre or degree.
@@ -59,7 +63,7 @@ def origin_of(source: ModelSource) -> NDArray[np.float64]:
 
 
 def iter_features(source: ModelSource) -> Iterator[Feature]:
-    """Give the buildings of a source as features; an id that was there before gets a number behind it."""
+    """Give what a source holds as features; an id that was there before gets a number behind it."""
     seen: set[int] = set()
     origin, step = origin_of(source), source.step
     for building in source.buildings():
@@ -76,10 +80,11 @@ def iter_features(source: ModelSource) -> Iterator[Feature]:
                 geometries.setdefault(shape.owner, []).append(found)
         objects = [
             CityObject(
+                building.kinds.get(owner, "Building" if owner == building.id else "BuildingPart"),
                 name,
                 {key: plain_value(value) for key, value in building.attributes.get(owner, {}).items()},
                 geometries.get(owner, []),
-                names.get(building.installations.get(owner, ""), ""),
+                names.get(building.parents.get(owner, ""), ""),
             )
             for owner, name in names.items()
         ]

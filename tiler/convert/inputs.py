@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -37,6 +37,8 @@ class ModelSource:
     high: NDArray[np.float64]
     notes: tuple[str, ...]  # what must be known of the files
     told: Counter[str]  # what was left out or changed, by what it is; each reading counts anew
+    # Whether storeys of buildings, roads, plant cover and trees are there.
+    around: bool = field(default=False, kw_only=True)
 
     @property
     def in_degrees(self) -> bool:
@@ -53,7 +55,7 @@ class ModelSource:
         """Give each building, in the order of the files."""
         self.told.clear()
         for path, frame in self.files:
-            for each in scan_model(path, attributes=True):
+            for each in scan_model(path, attributes=True, around=self.around):
                 if isinstance(each, ModelBuilding):
                     self.told["what cannot be read"] += len(each.faults)
                     self.told["buildings without surfaces"] += not each.shapes
@@ -63,7 +65,9 @@ class ModelSource:
 
 
 @contextmanager
-def open_source(paths: Sequence[Path], *, crs: str = "", axis_order: str = "") -> Iterator[ModelSource]:
+def open_source(
+    paths: Sequence[Path], *, crs: str = "", axis_order: str = "", around: bool = False
+) -> Iterator[ModelSource]:
     """Open city models, or the city model of a run.
 
     Parameters
@@ -74,6 +78,8 @@ def open_source(paths: Sequence[Path], *, crs: str = "", axis_order: str = "") -
         CRS of the output; ``""`` for that of the files.
     axis_order : str
         ``"xy"`` or ``"yx"``, against what the files show.
+    around : bool
+        As of `ModelSource`.
 
     Raises
     ------
@@ -88,7 +94,8 @@ def open_source(paths: Sequence[Path], *, crs: str = "", axis_order: str = "") -
     sequence in a temporary folder, as a document would be read as a whole.
     """
     with TemporaryDirectory() as folder:
-        headers = [_read_header(path, axis_order, Path(folder) / f"{k}.jsonl") for k, path in enumerate(paths)]
+        copies = (Path(folder) / f"{k}.jsonl" for k in range(len(paths)))
+        headers = [_read_header(*each, axis_order, around=around) for each in zip(paths, copies, strict=True)]
         own = headers[0].crs
         for other in headers[1:]:
             if (own is None) != (other.crs is None) or (own and other.crs and not same_crs(own, other.crs)):
@@ -108,6 +115,7 @@ def open_source(paths: Sequence[Path], *, crs: str = "", axis_order: str = "") -
             np.array([xmax, ymax, max(header.bounds[5] for header in headers)]),
             tuple(f"{one.path}: {note}" for one in headers for note in (one.unread, _axes_note(one)) if note),
             Counter(),
+            around=around,
         )
 
 
@@ -116,7 +124,7 @@ def _axes_note(header: CloudHeader) -> str:
     return f"the {first} comes first: {header.axes}" if header.axes else ""
 
 
-def _read_header(path: Path, axis_order: str, sequence: Path) -> CloudHeader:
+def _read_header(path: Path, sequence: Path, axis_order: str, *, around: bool) -> CloudHeader:
     known = None
     if path.is_dir():
         if not (path / CITY_MODEL).is_file():
@@ -125,7 +133,7 @@ def _read_header(path: Path, axis_order: str, sequence: Path) -> CloudHeader:
         known, path = parse_crs(read_crs(path / RUN_RECORD)), sequence
     if kind_of(path) != MODEL:
         raise InputError(f"{path}: is no city model; mesh a point cloud first, then convert the folder of the run")
-    header = read_model_header(path, axis_order)
+    header = read_model_header(path, axis_order, around=around)
     if known is not None:  # of a run: the easting comes first, without a word
         header = replace(header, axes="")
     if not header.n_points:

@@ -42,7 +42,7 @@ def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
         xyz = xyz * source.step
         triangles, face, n_fans = triangulate(faces, xyz, number.ravel().tolist())
         source.told["faces that cross themselves, cut into triangles around a corner"] += n_fans
-        parts = [own for owner, own in building.attributes.items() if owner not in building.installations]
+        parts = [own for owner, own in building.attributes.items() if owner not in building.kinds]
         attributes = {key: value for own in parts for key, value in own.items()}
         attributes |= building.attributes.get(building.id, {})
         kept = {key: plain_value(value) for key, value in attributes.items()}

@@ -130,7 +130,8 @@ class DetailedSource(ModelSource):
             building,
             shapes=tuple(detailed),
             attributes=attributes,
-            installations=installations,
+            kinds=dict.fromkeys(installations, "BuildingInstallation"),
+            parents=installations,
             pictures=pictures,
         )
 

@@ -13,7 +13,7 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.architecture.draw import LEAST_RISE, draw_house
+from pipeline.architecture.draw import LEAST_RISE, Ground, draw_house
 from pipeline.architecture.lots import Lot, lot_random
 from pipeline.architecture.parameters import House, Rings
 from pipeline.architecture.roof_sides import list_sides
@@ -54,11 +54,15 @@ class Augmented:
     counts: Counter[str]
 
 
-def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augmented:
+def augment(
+    path: Path, rules: Mapping[str, Distribution], *, seed: int, ground: Ground = lambda x, y: 0.0
+) -> Augmented:
     """Draw what the attributes of footprints, polygons of a file in a metric CRS, do not say; all are in memory.
 
     Rectangles are houses with walls and openings; outlines of any form are where the rules have footprints that
     are no rectangles.
+
+    Houses without a height of their ground stand on `ground`.
 
     What is drawn depends on `seed`, not negative, the rules, the attributes and the place of a footprint alone.
 
@@ -97,7 +101,7 @@ def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augm
             counts["footprints that are no rectangles, or have another roof: without walls and openings"] += 1
             continue
         try:
-            house = _make_house(rules, outline, drawn, tree, number, seed, rectangular=rectangular)
+            house = _make_house(rules, outline, drawn, tree, number, seed, ground, rectangular=rectangular)
         except GeometryError:
             counts["footprints whose roof has slivers: without walls and openings"] += 1
             continue
@@ -132,7 +136,7 @@ class _Drawn:
     eaves: float
     rise: float
     run: float
-    ground: float
+    ground: float | None
     year: int
     use: str
 
@@ -182,7 +186,7 @@ def _draw(rules: Mapping[str, Distribution], outline: Any, told: Mapping[str, An
         eaves = height - rise
         storeys = int(told.get("storeys", max(round(eaves / storey), 1)))
     year, use = int(told.get("year", drawn["year"])), str(told.get("use", drawn["use"]))
-    ground = float(told.get("ground", 0.0))
+    ground = told.get("ground")
     return _Drawn(shape, _WORDS.get(word, word), max(storeys, 1), eaves, rise, run, ground, year, use)
 
 
@@ -193,6 +197,7 @@ def _make_house(
     tree: Any,
     number: int,
     seed: int,
+    ground: Ground,
     *,
     rectangular: bool,
 ) -> House:
@@ -232,7 +237,8 @@ def _make_house(
         plan = tuple(tuple((x, y) for x, y in ring) for ring in local)
     lot = Lot(*place, float(centre[0]), float(centre[1]), size, rotation)
     rise = None if rectangular else round(drawn.rise, 3)
-    house = draw_house(own, lot, lambda x, y: drawn.ground, seed=seed, plan=plan, rise=rise)
+    foot = ground if drawn.ground is None else lambda x, y: drawn.ground
+    house = draw_house(own, lot, foot, seed=seed, plan=plan, rise=rise)
     if plan and min(shapely.minimum_clearance(side.polygon) for side in list_sides(house)) < CLEARANCE:
         raise GeometryError(f"house {house.id}: a side of its roof is narrower than {CLEARANCE:g} m")
     return replace(house, openings=tuple(one for one in house.openings if one.wall not in shared))

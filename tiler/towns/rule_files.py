@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from pipeline.architecture.rules import PRESETS, SIZES, WORDS, Distribution, make_rules
+from pipeline.architecture.rules import PRESETS, SIZES, WORDS
 from pipeline.data.errors import ConfigError
 
 LARGEST = 1 << 20  # bytes of a file of rules
@@ -26,20 +26,6 @@ def read_rules(path: Path) -> dict[str, Any]:
     if not isinstance(rules, dict):
         raise ConfigError(f"{path}: holds no table of rules")
     return rules
-
-
-def make_file_rules(path: Path | None, preset: str) -> dict[str, Distribution]:
-    """Make the rules of a preset, with others of a file.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, or a rule is not known or out of range.
-    """
-    try:
-        return make_rules({} if path is None else read_rules(path), preset=preset)
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from error
 
 
 def rule_schema() -> dict[str, Any]:

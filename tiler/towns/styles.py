@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from pipeline.architecture.draw import draw_house
-from pipeline.architecture.lots import Lot, list_lots, list_open_lots
+from pipeline.architecture.lots import Lot, list_lots, list_open_lots, lot_steps
 from pipeline.architecture.parameters import House
 from pipeline.architecture.plants import Tree, draw_trees
 from pipeline.architecture.rules import Distribution, make_rules
@@ -38,7 +39,11 @@ STYLES = {
     "apartments": Style("apartments", "random", 60.0),
     "towers": Style("towers", "grid", 55.0),
     "wings": Style("wings", "random", 44.0),
+    "mixed": Style("detached", "quarters", 24.0),
 }
+QUARTER = 240.0  # m, side of the quarters of a mixed town, on whole multiples
+QUARTERS = {"detached": 0.35, "terraces": 0.2, "blocks": 0.15, "wings": 0.1, "apartments": 0.15, "towers": 0.05}
+_FAR = 10**8  # between numbers of trees of different styles
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +57,8 @@ class Town:
     relief: float  # highest minus lowest ground, about (m)
     trees: float = 0.0  # share of the corners of lots that have a tree
     water: float = 0.0  # share of the relief that lakes fill; no house stands in them
+    highest: float = 0.0  # height of given houses (m), where those drawn by rules are no measure
+    ground_seed: int = -1  # what the ground is drawn from; negative for `seed`
 
     def lots(self, box: Box) -> Iterator[Lot]:
         """List the lots whose centre lies in a box (m), and in the town."""
@@ -91,6 +98,11 @@ class Town:
         return max(box[0], west), max(box[1], south), min(box[2], east), min(box[3], north)
 
     @property
+    def spacing(self) -> tuple[float, float]:
+        """From a lot to the next one eastwards and northwards (m)."""
+        return lot_steps(self.style.placement, self.style.lot, self._depth)
+
+    @property
     def _depth(self) -> float:
         return self.rules["width"].limits()[1]
 
@@ -104,7 +116,8 @@ class Town:
         """Height (m) that nothing of the town is above."""
         most = {name: self.rules[name].limits()[1] for name in ("storeys", "storey_height", "roof_pitch")}
         rise = self._depth * math.tan(math.radians(most["roof_pitch"]))
-        return LOWEST + self.relief + most["storeys"] * most["storey_height"] + rise + 2.0
+        drawn = LOWEST + self.relief + most["storeys"] * most["storey_height"] + rise
+        return max(drawn, self.highest) + 2.0
 
     @property
     def steepest(self) -> float:
@@ -113,7 +126,8 @@ class Town:
 
     @cached_property
     def _phases(self) -> list[float]:
-        phases: list[float] = (np.random.default_rng([self.seed, 7]).random(len(_WAVES)) * 2 * np.pi).tolist()
+        seed = self.seed if self.ground_seed < 0 else self.ground_seed
+        phases: list[float] = (np.random.default_rng([seed, 7]).random(len(_WAVES)) * 2 * np.pi).tolist()
         return phases
 
     def ground(self, x: Any, y: Any) -> Any:
@@ -123,6 +137,54 @@ class Town:
             for (east, north, share), turn in zip(_WAVES, self._phases, strict=True)
         )
         return LOWEST + self.relief / 2 * (1 + sum(waves))
+
+
+@dataclass(frozen=True, eq=False)
+class MixedTown(Town):
+    """A town whose quarters are of other styles, drawn by their place; lots lie within their quarter."""
+
+    parts: tuple[Town, ...] = ()  # towns of the styles of `QUARTERS`, on the ground of this one
+
+    def lots(self, box: Box) -> Iterator[Lot]:
+        """List the lots of all quarters, as of `Town`."""
+        return (lot for k, inner in self._quarters(box) for lot in self.parts[k].lots(inner))
+
+    def draw(self, lot: Lot) -> House | None:
+        """Draw the house of a lot by the rules of its quarter."""
+        return self.parts[self._style_of(int(lot.x // QUARTER), int(lot.y // QUARTER))].draw(lot)
+
+    def plants(self, box: Box) -> Iterator[Tree]:
+        """Draw the trees of all quarters, as of `Town`."""
+        for k, inner in self._quarters(box):
+            for tree in self.parts[k].plants(inner):
+                yield replace(tree, i=tree.i + k * _FAR)
+
+    def open_lots(self, box: Box) -> Iterator[Lot]:
+        """List the lots of streets and courtyards of all quarters, as of `Town`."""
+        return (lot for k, inner in self._quarters(box) for lot in self.parts[k].open_lots(inner))
+
+    @property
+    def reach(self) -> float:
+        """How far from the centre of a lot its house may reach (m), at most."""
+        return max(part.reach for part in self.parts)
+
+    @property
+    def top(self) -> float:
+        """Height (m) that nothing of the town is above."""
+        return max(self.highest, *(part.top for part in self.parts))
+
+    def _quarters(self, box: Box) -> Iterator[tuple[int, Box]]:
+        """List the quarters in a box: style, and what of the box centres of whole lots may lie in."""
+        columns, rows = (range(math.floor(box[k] / QUARTER), math.ceil(box[k + 2] / QUARTER)) for k in (0, 1))
+        for b, a in product(rows, columns):
+            k = self._style_of(a, b)
+            x, y = (step / 2 for step in self.parts[k].spacing)
+            west, south = max(box[0], a * QUARTER + x), max(box[1], b * QUARTER + y)
+            yield k, (west, south, min(box[2], (a + 1) * QUARTER - x), min(box[3], (b + 1) * QUARTER - y))
+
+    def _style_of(self, a: int, b: int) -> int:
+        rng = np.random.default_rng([self.seed, 12, a % 2**32, b % 2**32])
+        return int(rng.choice(len(QUARTERS), p=list(QUARTERS.values())))
 
 
 def make_town(
@@ -149,4 +211,12 @@ def make_town(
         raise ValueError(f"bounds {bounds}, seed {seed}, relief {relief}")
     if not (0 <= trees <= 1 and 0 <= water < 1):
         raise ValueError(f"trees {trees:g}, water {water:g}; expected shares from 0 to 1")
-    return Town(bounds, STYLES[style], make_rules(given, preset=STYLES[style].preset), seed, relief, trees, water)
+    town = Town(bounds, STYLES[style], make_rules(given, preset=STYLES[style].preset), seed, relief, trees, water)
+    if style != "mixed":
+        return town
+    parts = []
+    for k, name in enumerate(QUARTERS):
+        own, rules = STYLES[name], make_rules(given, preset=STYLES[name].preset)
+        # Another seed for each style: lots of different styles may have the same numbers.
+        parts.append(replace(town, style=own, rules=rules, seed=seed * len(QUARTERS) + k, ground_seed=seed))
+    return MixedTown(bounds, town.style, town.rules, seed, relief, trees, water, parts=tuple(parts))

@@ -1,7 +1,7 @@
 """Write a town: parameters of its houses, their city model, footprints, and the points of a flight."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice, product
@@ -27,12 +27,26 @@ from tiler.towns.styles import Box, Town, make_town
 from tiler.towns.synthetic_files import DAY
 from tiler.towns.town_models import fault_feature, model_head
 from tiler.towns.town_scan import check_flight
-from tiler.towns.town_tile import CRS, ModelOptions, Output, TownTile, house_outline, write_tile
+from tiler.towns.town_tile import (
+    CRS,
+    GIVEN,
+    Batch,
+    ModelOptions,
+    Output,
+    Pieces,
+    TownTile,
+    house_outline,
+    scan_given,
+    sort_houses,
+    write_batch,
+    write_tile,
+)
 
 TILE = 500.0  # m, of files of points, and of houses that are in memory at a time
 MOST_SIZE, MOST_DENSITY = 1e6, 1000.0  # m, points/m2
 CLASS_ERRORS = 0.01
 BATCH = 500  # houses of other origins that are in memory at a time
+BORDER = 20.0  # m, scanned around them
 MOST_NOISE = 10.0  # m
 
 
@@ -126,40 +140,99 @@ def write_town(
     -----
     Tiles are drawn once, each for all of its files: memory does not grow with the town.
     """
-    for name, value in (("density", density), ("lidar", lidar)):
-        if not 0 <= value <= MOST_DENSITY:
-            raise ConfigError(f"--{name} {value:g}: expected 0 to {MOST_DENSITY:g} points per m2")
-    if not 0 <= class_errors <= 1:
-        raise ConfigError(f"--class-errors {class_errors:g}: expected 0 to 1")
-    check_workers(workers)
+    check_scan(density, lidar, class_errors, workers)
     if lidar > 0:
         check_flight(town)
     tile = TownTile(directory, town, town.bounds, (0, 0), density, lidar, class_errors, output)
     tiles = [replace(tile, box=box, numbers=numbers) for box, numbers in list_tiles(town.bounds)]
     clouds = [one.cloud for one in tiles] if density or lidar else []
     with _open_town(directory, output, CRS, clouds=clouds) as files:
-        for tile, houses in zip(tiles, map_in_order(write_tile, tiles, workers), strict=True):
-            for kind, file in files.opened.items():
-                with tile.piece(kind).open("rb") as piece:
-                    copyfileobj(piece, file)
-            with tile.piece("outline").open() as lines:
-                files.append_footprints([json.loads(line) for line in lines])
-            rmtree(tile.folder)
-            files.houses += houses
+        for pieces in map_in_order(write_tile, tiles, workers):
+            files.append(pieces)
     return _list_files(directory, clouds, files.houses)
 
 
-def write_houses(directory: Path, houses: Iterable[House], output: Output, *, crs: str = CRS) -> TownFiles:
-    """Write houses of any origin as a town without points; a few of them are in memory."""
-    with _open_town(directory, output, crs, clouds=[]) as files:
-        rest = iter(houses)
-        while batch := list(islice(rest, BATCH)):
-            for house in batch:
-                for kind, line in output.house_lines(house).items():
-                    files.opened[kind].write(line.encode())
-            files.append_footprints([(house.id, *house_outline(house)) for house in batch])
-            files.houses += len(batch)
-    return _list_files(directory, [], files.houses)
+def write_houses(
+    directory: Path,
+    houses: Callable[[], Iterable[House]],
+    output: Output,
+    *,
+    town: Town,
+    lidar: float = 0.0,
+    class_errors: float = CLASS_ERRORS,
+    crs: str = CRS,
+    workers: int = 0,
+) -> TownFiles:
+    """Write houses of any origin, and points of a scanner if asked for; a few of them are in memory.
+
+    Parameters
+    ----------
+    houses : callable
+        Gives them, each time the same ones.
+    town : Town
+        The ground that is scanned, and its seed.
+    crs : str
+        Of the houses, metric.
+    directory, output, lidar, class_errors, workers
+        As of `write_town`.
+
+    Raises
+    ------
+    ConfigError, OutputError
+        As of `write_town`.
+    """
+    check_scan(0.0, lidar, class_errors, workers)
+    tiles: list[TownTile] = []
+    with ExitStack() as stack:
+        if lidar:
+            stack.callback(rmtree, directory / GIVEN, ignore_errors=True)
+            town = _sort_given(directory / GIVEN, houses(), town)
+            check_flight(town)
+            tile = TownTile(directory, town, town.bounds, (0, 0), 0.0, lidar, class_errors, output, crs)
+            tiles = [replace(tile, box=box, numbers=numbers) for box, numbers in list_tiles(town.bounds)]
+        clouds = [one.cloud for one in tiles]
+        files = stack.enter_context(_open_town(directory, output, crs, clouds=clouds))
+        batches = (Batch(directory, number, batch, output) for number, batch in enumerate(_batches(houses())))
+        for pieces in map_in_order(write_batch, batches, workers):
+            files.append(pieces)
+        for _ in map_in_order(scan_given, tiles, workers):
+            pass
+    return _list_files(directory, clouds, files.houses)
+
+
+def _batches(houses: Iterable[House]) -> Iterator[list[House]]:
+    rest = iter(houses)
+    while batch := list(islice(rest, BATCH)):
+        yield batch
+
+
+def _sort_given(folder: Path, houses: Iterable[House], town: Town) -> Town:
+    """Sort houses into files of tiles, and give the town that they make on the ground of another one."""
+    low, high, top = np.full(2, np.inf), np.full(2, -np.inf), 0.0
+    with _output_errors(folder.parent):
+        rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    for batch in _batches(houses):
+        with _output_errors(folder.parent):
+            sort_houses(folder, batch, TILE)
+        corners = [corner for house in batch for ring in house_outline(house)[1] for corner in ring]
+        low, high = np.minimum(low, np.min(corners, axis=0)), np.maximum(high, np.max(corners, axis=0))
+        top = max(top, *(one.z + one.height + one.roof.rise for one in batch))
+    if not np.isfinite(low).all():
+        raise ConfigError("--lidar: there are no houses; give parameters or footprints of some")
+    west, south = (np.floor(low) - BORDER).tolist()
+    east, north = (np.ceil(high) + BORDER).tolist()
+    return replace(town, bounds=(west, south, east, north), highest=top)
+
+
+def check_scan(density: float, lidar: float, class_errors: float, workers: int) -> None:
+    """Raise ConfigError for an option of points that is out of range."""
+    for name, value in (("density", density), ("lidar", lidar)):
+        if not 0 <= value <= MOST_DENSITY:
+            raise ConfigError(f"--{name} {value:g}: expected 0 to {MOST_DENSITY:g} points per m2")
+    if not 0 <= class_errors <= 1:
+        raise ConfigError(f"--class-errors {class_errors:g}: expected 0 to 1")
+    check_workers(workers)
 
 
 def make_output(
@@ -195,6 +268,16 @@ class _OpenTown:
     crs: str
     houses: int = 0
 
+    def append(self, pieces: Pieces) -> None:
+        """Append pieces to the files, and remove them."""
+        for kind, file in self.opened.items():
+            with (pieces.folder / kind).open("rb") as piece:
+                copyfileobj(piece, file)
+        with (pieces.folder / "outline").open() as lines:
+            self.append_footprints([json.loads(line) for line in lines])
+        rmtree(pieces.folder)
+        self.houses += pieces.houses
+
     def append_footprints(self, rows: Sequence[tuple[str, float, list[list[list[float]]]]]) -> None:
         """Append outlines with id and height; a file without any is written, too."""
         there = self.footprints.exists()
@@ -213,7 +296,7 @@ class _OpenTown:
 @contextmanager
 def _open_town(directory: Path, output: Output, crs: str, *, clouds: Sequence[Path]) -> Iterator[_OpenTown]:
     """Open the files of a town with their heads, and close them with their ends."""
-    try:
+    with _output_errors(directory):
         (directory / "tiles").mkdir(parents=True, exist_ok=True)
         strangers = set((directory / "tiles").iterdir()) - set(clouds)
         if strangers:
@@ -232,6 +315,12 @@ def _open_town(directory: Path, output: Output, crs: str, *, clouds: Sequence[Pa
             opened["xml"].write(XML_HEAD.encode())
             yield _OpenTown(opened, footprints, crs)
             opened["xml"].write(XML_END.encode())
+
+
+@contextmanager
+def _output_errors(directory: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise OutputError(f"{directory}: cannot be written ({error}); give a folder that can") from error
 

@@ -55,18 +55,18 @@ def variant_feature(house: House, asked: Representation) -> str:
         made = {asked.level: make_representation(house, asked)}
         return _house_line(house, made, semantics=semantics)
     vertices = _Vertices()
-    objects: dict[str, Any] = {house.id: {"type": "Building", "attributes": describe_house(house), "geometry": []}}
-    rooms = make_interior(house, asked.level)
-    for room in rooms:
+    objects, names = _describe_parts(house)
+    for room in make_interior(house, asked.level):
+        owner = names[room.volume.part]
         geometry = [_geometry(asked.level, room.volume, vertices, semantics=False)]
         if room.storey < 0:
-            objects[house.id]["geometry"] = geometry
+            objects[owner]["geometry"] = geometry
             continue
-        name = f"{house.id}-storey-{room.storey}"
-        objects[house.id].setdefault("children", []).append(name)
+        name = f"{owner}-storey-{room.storey}"
+        objects[owner].setdefault("children", []).append(name)
         objects[name] = {
             "type": "BuildingStorey",
-            "parents": [house.id],
+            "parents": [owner],
             "attributes": {"storey": room.storey},
             "geometry": geometry,
         }
@@ -163,26 +163,29 @@ class _Vertices:
 
 
 def _house_line(house: House, made: dict[str, list[Volume]], *, semantics: bool = True) -> str:
-    names = [f"{house.id}-{part.kind}-{k + 1}" for k, part in enumerate(house.parts)]
     vertices = _Vertices()
-    geometry: dict[str, list[dict[str, Any]]] = {name: [] for name in (house.id, *names)}
+    objects, names = _describe_parts(house)
     for level, volumes in made.items():
         for volume in volumes:
-            owner = house.id if volume.part < 0 else names[volume.part]
-            geometry[owner].append(_geometry(level, volume, vertices, semantics=semantics))
-    objects: dict[str, Any] = {
-        house.id: {"type": "Building", "attributes": describe_house(house), "geometry": geometry[house.id]}
-    }
+            geometry = _geometry(level, volume, vertices, semantics=semantics)
+            objects[names[volume.part]]["geometry"].append(geometry)
+    return _feature_line(house.id, objects, vertices)
+
+
+def _describe_parts(house: House) -> tuple[dict[str, Any], dict[int, str]]:
+    """Give the objects of a house and its parts without geometry, and their names by `Volume.part`."""
+    names = {k: f"{house.id}-{part.kind}-{k + 1}" for k, part in enumerate(house.parts)}
+    objects: dict[str, Any] = {house.id: {"type": "Building", "attributes": describe_house(house), "geometry": []}}
     if names:
-        objects[house.id]["children"] = names
-    for name, part in zip(names, house.parts, strict=True):
+        objects[house.id]["children"] = list(names.values())
+    for name, part in zip(names.values(), house.parts, strict=True):
         objects[name] = {
             "type": "BuildingPart",
             "parents": [house.id],
             "attributes": {"function": part.kind, "measuredHeight": part.height},
-            "geometry": geometry[name],
+            "geometry": [],
         }
-    return _feature_line(house.id, objects, vertices)
+    return objects, names | {-1: house.id}
 
 
 def _feature_line(name: str, objects: dict[str, Any], vertices: _Vertices) -> str:

@@ -113,6 +113,7 @@ def test_houses_with_wings_are_valid_at_all_levels(footprint: str, shapes: tuple
             assert [found for one in volumes if (found := faults(one))] == [], (shape, level)
         for room in make_interior(house, "2.3")[::-1][:2] + make_interior(house, "1"):
             assert faults(room.volume) == set()
+        assert make_interior(house, "2.2")[-1].volume.part == 0
         if shape == "shed":
             border = house.plan[0]
             with pytest.raises(GeometryError, match="begin it elsewhere"):
@@ -149,15 +150,21 @@ def check_heights(house: House) -> None:
 
 
 def test_interiors_are_valid_and_lie_within_the_house() -> None:
-    attics = 0
+    attics = dormers = parts = 0
     for house in some_houses(1):
-        shell = total_volume(make_representation(house, Representation("x", "2.0", kind="solid")))
+        shell = total_volume(make_representation(house, Representation("x", "2.2", kind="solid")))
         rooms = {level: make_interior(house, level) for level in ("0", "1", "2.2", "2.3")}
-        assert len(rooms["0"]) == len(rooms["2.2"]) == house.storeys
+        assert [sum(room.volume.part >= 0 for room in each) for each in rooms.values()] == [len(house.parts)] * 4
+        assert len(rooms["0"]) - len(house.parts) == house.storeys
         for level in ("1", "2.2", "2.3"):
-            assert [found for room in rooms[level][-2:] if (found := faults(room.volume))] == []
+            assert [found for room in rooms[level][-3:] if (found := faults(room.volume))] == []
             assert 0.3 * shell < total_volume([room.volume for room in rooms[level]]) < shell
-        attics += len(rooms["2.3"]) - house.storeys
+        attics += sum(room.storey == house.storeys for room in rooms["2.3"])
+        plain_attic, attic = (total_volume([room.volume for room in rooms[level]]) for level in ("2.2", "2.3"))
+        dormers += attic > plain_attic + 0.1
+        parts += len(house.parts)
         tops = [z for room in rooms["2.3"] for one in room.volume.surfaces for *_, z in one.border]
         assert max(tops) < house.z + house.height + house.roof.rise - 0.15
     assert attics > 1
+    assert dormers
+    assert parts

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 import shapely
@@ -13,8 +15,9 @@ from pipeline.architecture.parameters import House
 from pipeline.architecture.scanner import FLIGHT, FORWARD, SPACING
 from pipeline.data.errors import ConfigError
 from pipeline.data.pointcloud import PointCloud
+from tiler.towns.parameter_files import read_json
 from tiler.towns.styles import LOWEST
-from tiler.towns.town import make_output, open_town, write_town
+from tiler.towns.town import make_output, open_town, write_houses, write_town
 from tiler.towns.town_scan import Scan, describe_truth, scan_strips
 from tiler.towns.town_tile import ModelOptions
 
@@ -95,6 +98,25 @@ def test_what_a_flight_cannot_scan_is_told(tmp_path: Path) -> None:
             write_town(tmp_path / "t", town, make_output(ModelOptions(), truth=True), density=0.0, lidar=lidar)
 
 
+def test_parameters_are_scanned_as_the_town_is(tmp_path: Path) -> None:
+    west, south = 317_955.0, 6_398_970.0
+    town = open_town(60.0, "wings", rules=None, seed=5, relief=12)
+    town = replace(town, bounds=(west, south, west + 90.0, south + 60.0))  # on both sides of a border of tiles
+    output = make_output(ModelOptions(("1.2",)), truth=True)
+    drawn = write_town(tmp_path / "drawn", town, output, density=0.0, lidar=1.0)
+    houses = partial(read_json, drawn.parameters)
+    given = write_houses(tmp_path / "given", houses, output, town=town, lidar=1.0)
+    assert len(given.clouds) > 1
+    assert given.houses == drawn.houses > 1
+    for one, other in ((drawn.parameters, given.parameters), (drawn.truth, given.truth)):
+        assert one.read_bytes() == other.read_bytes()
+    points, more = (np.concatenate([laspy.read(path).xyz for path in each.clouds]) for each in (drawn, given))
+    west, south, east, north = town.bounds
+    inside = (more[:, 0] >= west) & (more[:, 0] < east) & (more[:, 1] >= south) & (more[:, 1] < north)
+    np.testing.assert_array_equal(np.unique(points, axis=0), np.unique(more[inside], axis=0))
+    assert not (tmp_path / "given/part-given").exists()
+
+
 @pytest.mark.long
 def test_workers_make_the_same_bytes(tmp_path: Path) -> None:
     town = replace(TOWN, bounds=(317_900.0, 6_398_900.0, 318_100.0, 6_399_100.0))  # four tiles
@@ -102,8 +124,13 @@ def test_workers_make_the_same_bytes(tmp_path: Path) -> None:
         write_town(
             tmp_path / name, town, make_output(ModelOptions(), truth=True), density=0.0, lidar=1.0, workers=workers
         )
-    files = sorted(path for path in (tmp_path / "one").rglob("*") if path.is_file())
-    assert len(files) == 5 + 4
-    for path in files:
-        other = tmp_path / "two" / path.relative_to(tmp_path / "one")
-        assert path.read_bytes() == other.read_bytes(), path
+    houses = partial(read_json, tmp_path / "one/parameters.jsonl")
+    for name, workers in (("three", 0), ("four", 2)):
+        output = make_output(ModelOptions(), truth=True)
+        write_houses(tmp_path / name, houses, output, town=town, lidar=1.0, workers=workers)
+    for first, second in (("one", "two"), ("three", "four")):
+        files = sorted(path for path in (tmp_path / first).rglob("*") if path.is_file())
+        assert len(files) == 5 + 4
+        for path in files:
+            other = tmp_path / second / path.relative_to(tmp_path / first)
+            assert path.read_bytes() == other.read_bytes(), path

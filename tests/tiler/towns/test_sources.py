@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pyogrio
 import pytest
@@ -78,9 +79,11 @@ def test_attributes_win_over_rules(tmp_path: Path, capsys: pytest.CaptureFixture
     broken = check_solids(read_document(tmp_path / "t/broken.city.jsonl"), ("1.2",))
     assert sum(map(bool, broken.values())) == 27
     # Parameters make the same model, and edited ones another.
-    again = ["--parameters", str(tmp_path / "t/parameters.jsonl")]
+    again = ["--parameters", str(tmp_path / "t/parameters.jsonl"), "--lidar", "2"]
     assert main(["synth", str(tmp_path / "u"), *style, *again]) == 0
     assert (tmp_path / "u/town.city.jsonl").read_bytes() == (tmp_path / "t/town.city.jsonl").read_bytes()
+    las = laspy.read(next((tmp_path / "u/tiles").glob("*.laz")))
+    assert {2, 6} <= set(np.asarray(las.classification).tolist())
     row = json.loads((tmp_path / "t/parameters.jsonl").read_text().splitlines()[1])
     assert row["id"] == "b"
     (tmp_path / "edited.jsonl").write_text(house_json(b))
@@ -103,10 +106,13 @@ def test_a_town_obeys_the_schemas(tmp_path: Path) -> None:
         kinds |= {thing["type"] for feature in features for thing in feature["CityObjects"].values()}
     assert kinds >= {"Building", "BuildingStorey", "Road", "PlantCover", "SolitaryVegetationObject"}
     gml = tmp_path / "t.gml"
-    assert (
-        main(["convert", str(tmp_path / "t/town.city.jsonl"), "--format", "citygml2", "--output", str(gml)]) == 0
-    )
-    assert validate_gml(gml, "2.0") == []
+    storeys = [str(tmp_path / f"t/variants/{name}.city.jsonl") for name in interiors[2:]]
+    town = [str(tmp_path / "t/town.city.jsonl"), *storeys, "--output", str(gml), "--overwrite"]
+    for version, inside in (("2", "Room"), ("3", "Storey")):
+        assert main(["convert", *town, "--format", f"citygml{version}"]) == 0
+        assert validate_gml(gml, f"{version}.0") == []
+        text = gml.read_text()
+        assert all(f":{kind} " in text for kind in (inside, "Road", "PlantCover", "SolitaryVegetationObject"))
 
 
 def test_the_parser_has_the_lists_of_the_packages() -> None:
@@ -124,6 +130,7 @@ def test_what_is_no_such_file_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
         (["--variants", "LOD9"], "--variants LOD9: no such representation"),
         (["--workers", "-2"], "--workers -2: expected 0, for this process, or more"),
         (["--class-errors", "0.2"], "--class-errors: are those of the points of --lidar"),
+        (["--parameters", "f.jsonl", "--lidar", "-8"], "--lidar -8: expected 0 to 1000"),
         (["--footprints", "f.gpkg", "--trees", "0.5"], "--trees: goes with towns that are drawn"),
     ):
         assert main(["synth", str(tmp_path / "t"), "--style", "grid", "--size", "50", *words]) in (1, 2)

@@ -28,7 +28,7 @@ from tiler.towns.rule_files import read_rules, rule_schema
 from tiler.towns.styles import STYLES
 from tiler.towns.town import make_output, open_town, write_town
 from tiler.towns.town_models import house_feature, model_head
-from tiler.towns.town_tile import ModelOptions
+from tiler.towns.town_tile import ModelOptions, house_outline
 
 
 def houses_of(style: str, size: float) -> list[House]:
@@ -241,6 +241,23 @@ def test_files_of_another_town_are_not_mixed_with(tmp_path: Path) -> None:
     shutil.copy(files.clouds[0], tmp_path / "tiles" / "other.laz")
     with pytest.raises(ConfigError, match=r"other.laz: is not of this town"):
         write_town(tmp_path, town, make_output(ModelOptions(("1.2",))), density=1.0)
+
+
+@pytest.mark.parametrize(("style", "seed", "size"), [("blocks", 12, 150.0), ("mixed", 1, 430.0)])
+def test_houses_do_not_overlap_and_do_not_depend_on_tiles(style: str, seed: int, size: float) -> None:
+    town = open_town(size, style, rules=None, seed=seed, relief=10, trees=0.3)
+    houses = list(town.houses(town.bounds))
+    assert len({house.id for house in houses}) == len(houses) > 50
+    assert style != "mixed" or len({house.width for house in houses}) > 5
+    outlines = [shapely.Polygon(border, holes) for _, (border, *holes) in map(house_outline, houses)]
+    one, other = shapely.STRtree(outlines).query(outlines, "intersects")
+    pairs = [(outlines[i], outlines[k]) for i, k in zip(one, other, strict=True) if i < k]
+    assert max((a.intersection(b).area for a, b in pairs), default=0.0) < 0.01
+    west, south, east, north = town.bounds
+    middle = west + 0.43 * size
+    for thing in (town.houses, town.plants, town.open_lots):
+        halves = [*thing((west, south, middle, north)), *thing((middle, south, east, north))]
+        assert sorted(map(repr, halves)) == sorted(map(repr, thing(town.bounds)))
 
 
 def test_edited_parameters_are_a_house_like_others(tmp_path: Path) -> None:
