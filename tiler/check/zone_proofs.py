@@ -1,8 +1,8 @@
 """The proofs of `citystitch check` that buildings and triangles are as detailed as the zones of detail ask for.
 
 Each building has the level of detail of the zone of its point. Facets of the top are the triangles of the plane
-mesh: each has an area of about h**2 / 2 at most, with the target edge length h in its middle. Houses and seams make
-smaller ones; on open ground none is much smaller.
+mesh: each has an area of about h**2 / 2 at most, with the target edge length h in its middle. Houses and seams
+make smaller ones; on open ground none is much smaller.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
