@@ -46,6 +46,6 @@ def find_kept(directory: Place) -> str:
     """Find what a run was to keep; both, where its record is of another build or damaged: its readers say so."""
     try:
         keep = json.loads((directory / RUN_RECORD).read_bytes())["parameters"]["keep"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return WHOLE
     return keep if keep in KEPT else WHOLE

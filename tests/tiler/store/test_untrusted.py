@@ -727,14 +727,16 @@ def test_nothing_that_is_read_is_run_or_unpickled() -> None:
     # An error is pickled and unpickled in one process, to learn whether it would survive the way from a worker.
     # Tasks are sent to workers by Dask, which pickles what it sends: who may connect to its scheduler is trusted.
     # What a process remembers of files is in its memory alone, pickled by itself so that each reader gets a copy.
-    # What workers of `check` and `generalise` leave for their command waits in a folder that it makes for itself
-    # alone (TemporaryDirectory); np.load unpickles nothing, if it is not told to.
+    # What workers of `check`, `generalise` and `texture` and their command leave for each other waits in a folder
+    # that it makes for itself alone (TemporaryDirectory); np.load unpickles nothing, if it is not told to.
     assert found == {
         "pickle.loads(pickle.dumps(error))",
         "pickle.loads(known[key][1])",
         "loads(packed)",
         "pickle.load(file)",
         "pickle.loads(path.read_bytes())",
+        "pickle.loads((work / 'job').read_bytes())",
+        "np.load(plants_file(work, camera.name))",
         "np.load(folder / f'{name}.npy', mmap_mode='r')",
         "np.lib.format.write_array(entry, array, version=(1, 0), allow_pickle=False)",
     }
