@@ -83,7 +83,7 @@ def check_export(directory: Path, path: Path) -> CheckReport:
     proofs, filled = _prove_cells(mesh)
     claims = (
         *proofs,
-        _prove_points(mesh, own - origin),
+        _prove_points(mesh, own, origin),
         *_prove_faces(mesh, np.concatenate(facets)),
         _prove_volume(filled, volume),
     )
@@ -198,15 +198,17 @@ def _middles(mesh: Polyhedra, rows: Ints) -> Vertices:
     return middles
 
 
-def _prove_points(mesh: Polyhedra, own: Vertices) -> Proof:
+def _prove_points(mesh: Polyhedra, own: Vertices, origin: Vertices) -> Proof:
     """Prove that points are those of the run, less a whole origin, and the others are used."""
-    same = (mesh.points[: len(own)] == own).all(axis=1)
+    same = (mesh.points[: len(own)] == own - origin).all(axis=1)
     unused = conformity.find_unused_points(
         np.where(mesh.faces < 0, mesh.faces[:, :1], mesh.faces), len(mesh.points)
     )
     more = len(mesh.points) - len(own)
     return Proof(
-        f"{len(own):,} points: those of the run, bit for bit"
+        f"{len(own):,} points: those of the run, "
+        + (f"less {', '.join(f'{part:.0f}' for part in origin)} m, " if origin.any() else "")
+        + "bit for bit"
         + (f", and {more:,} in the middle of cells" if more else ""),
         (
             *find_faults("point-moved", own[~same], "another place than in the run"),

@@ -31,6 +31,14 @@ def test_exports_of_a_run_are_proved(
     assert "everything is proved" in capsys.readouterr().out
 
 
+def test_the_origin_of_an_export_is_told(
+    small_run: Path, exported: Exported, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = exported(small_run, "msh", *HYBRID, "--origin", "5,-7,2")
+    assert main(["check", str(small_run), "--export", str(path)]) == 0
+    assert "those of the run, less 5, -7, 2 m, bit for bit" in capsys.readouterr().out
+
+
 def test_parts_have_the_cells_and_faces_of_the_whole(small_run: Path, exported: Exported) -> None:
     found = []
     whole = exported(small_run, "openfoam", *HYBRID) / "constant/polyMesh"
