@@ -28,6 +28,7 @@ from tests.helpers.tiles import (
 from tiler.check.check_piece import read_piece
 from tiler.check.proofs import Finding, join_findings, make_surface
 from tiler.check.zone_proofs import (
+    BLOCK_ROWS,
     check_sizes_of_zones,
     check_zones,
     prove_sizes_of_zones,
@@ -44,6 +45,7 @@ from tiler.planning.lod_zones import read_zones
 from tiler.planning.own_stages import OwnStages
 from tiler.planning.plan import make_plan
 from tiler.planning.region import Region
+from tiler.store.kept import is_kept
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.results import StoredTerrain
 from tiler.store.run_folder import RoofRules, RunRecord, SizesAsked, read_run_record
@@ -230,6 +232,7 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
     x, y = next(row[LOD_POINT] for row in told.values() if row[LOD] == "1.2")
     assert not prove_levels(text, asked, tmp_path / "out", tmp_path)
     assert prove_levels(text, (*asked[:-1], ("0C", 6.0, "")), tmp_path / "out", tmp_path) == {"level-of-zone"}
+    assert is_kept(BLOCK_ROWS, "pieces")  # what a run was given stays for `check`
     # A block of another height, level or point than the run was given, and one that it was not given.
     for was, now, kind in (
         ('"roof_height":15.0', '"roof_height":15.1', "block-height"),
