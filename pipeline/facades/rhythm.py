@@ -92,9 +92,7 @@ def _period(profile: Array, step: float, bounds: tuple[float, float], axis: str)
     if best < LEAST_MATCH:
         raise ValueError(f"nothing repeats {axis}: the best match is {best:.2f}; bound: {LEAST_MATCH}")
     lag = next(k for k in peaks if match[k] >= NEARLY * best)
-    # Many periods tell one better than the next one does: the lag follows the peak at its multiples.
-    found = _peak(match, lag)
-    return found * step, float(match[lag])
+    return _peak(match, lag) * step, float(match[lag])
 
 
 def _peak(match: Array, lag: int) -> float:
@@ -151,7 +149,7 @@ def _wall_of(mean: Array) -> float:
 
 
 def _extent(off: Array, axis: int) -> tuple[int, int]:
-    """Give where the window begins and ends along the other axis: its longest run above half of the most."""
+    """Give the first and the last place along the other axis above half of the most."""
     profile = np.percentile(off, 75, axis=axis)
     inside = np.concatenate(([False], profile > 0.5 * profile.max(), [False]))
     change = np.flatnonzero(np.diff(inside.astype(int)))

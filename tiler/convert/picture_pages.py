@@ -1,14 +1,14 @@
 """Pages of pictures for the textures of a GLB: squares that are filled row by row, and written as PNG."""
 
-import struct
 from dataclasses import dataclass, field
 from typing import IO
 
 import numpy as np
-from deflate import crc32, zlib_compress
+from deflate import zlib_compress
 
 from pipeline.facades.graph import Insert
 from pipeline.facades.pictures import PIXEL, Colours, Image, Picture, count_pixels, draw_picture
+from tiler.pictures.png import RGB, frame_png
 
 PAGE = 1024  # pixels, side of a page
 GUTTER = 2  # pixels around a picture that repeat its border, for viewers that blur textures
@@ -88,9 +88,4 @@ def write_png(image: Image) -> bytes:
     height, width = image.shape[:2]
     rows = np.diff(image.reshape(height, -1), axis=0, prepend=np.zeros((1, 3 * width), np.uint8))
     data = np.column_stack((np.full(height, 2, np.uint8), rows)).tobytes()
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = [(b"IHDR", head), (b"IDAT", bytes(zlib_compress(data, LEVEL))), (b"IEND", b"")]
-    chunks = (
-        struct.pack(">I", len(part)) + kind + part + struct.pack(">I", crc32(kind + part)) for kind, part in parts
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+    return frame_png((width, height), RGB, bytes(zlib_compress(data, LEVEL)))

@@ -99,11 +99,6 @@ class RegionFaces:
         """Number of faces with two cells."""
         return int(self.face_start[-1])
 
-    def piece_of(self, cell: Ints) -> Ints:
-        """Return which piece has each cell, by their numbers over the region."""
-        found: Ints = np.searchsorted(self.cell_start, cell, side="right") - 1
-        return found
-
 
 @dataclass(frozen=True, eq=False)
 class OwnFaces:

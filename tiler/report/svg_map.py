@@ -2,12 +2,13 @@
 
 import base64
 import math
-import struct
 import zlib
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+
+from tiler.pictures.png import PALETTE, frame_png
 
 
 class FootprintRaster:
@@ -77,17 +78,8 @@ def encode_png(alpha: NDArray[np.uint8], colour: str = "#464646") -> bytes:
     rows, columns = alpha.shape
     lines = np.zeros((rows, 1 + columns), np.uint8)
     lines[:, 1:] = alpha
-    chunks = (
-        (b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)),
-        (b"PLTE", 256 * bytes.fromhex(colour[1:])),
-        (b"tRNS", bytes(range(256))),
-        (b"IDAT", zlib.compress(lines.tobytes(), 9)),
-        (b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
-    )
+    palette = (b"PLTE", 256 * bytes.fromhex(colour[1:])), (b"tRNS", bytes(range(256)))
+    return frame_png((columns, rows), PALETTE, zlib.compress(lines.tobytes(), 9), palette)
 
 
 def draw_image(png: bytes, size: tuple[float, float], attributes: str = "") -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from tiler.convert.obj_files import GROUPS
 from tiler.textures.cameras import Camera
 from tiler.textures.paint import NO_IMAGE, Painted
-from tiler.textures.surfaces import Surface, Tile
+from tiler.textures.surfaces import Tile
 from tiler.textures.views import REASONS, Ranking
 
 WHOLE = 0.99  # part of a surface that images show, below which it is listed
@@ -27,12 +27,6 @@ class TileQuality:
     surfaces: list[dict[str, Any]]
 
 
-def area_of(surface: Surface) -> float:
-    """Give the area of a surface (m²)."""
-    a, b, c = surface.corners.swapaxes(0, 1)
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-
-
 def judge(
     name: str, tile: Tile, painted: Sequence[Painted | None], ranking: Ranking, cameras: Sequence[Camera]
 ) -> TileQuality:
@@ -45,7 +39,7 @@ def judge(
     left: list[dict[str, Any]] = []
     for k, building in enumerate(tile.names):
         own = [j for j, surface in enumerate(tile.surfaces) if surface.building == k]
-        areas = {j: area_of(tile.surfaces[j]) for j in own}
+        areas = {j: tile.surfaces[j].area for j in own}
         shown = {j: 0.0 if (one := painted[j]) is None else one.share for j in own}
         seen = sum(areas[j] * shown[j] for j in own)
         scale = sum(areas[j] * shown[j] * one.scale for j in own if (one := painted[j]) is not None)

@@ -54,6 +54,12 @@ class Surface:
     size: Array
     corners: Array
 
+    @property
+    def area(self) -> float:
+        """Its area (m²)."""
+        a, b, c = self.corners.swapaxes(0, 1)
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
 
 @dataclass(frozen=True, eq=False)
 class Tile:

@@ -139,15 +139,10 @@ def rank_images(
             reached[row] = max(reached[row], int(state.max()))
             seen = (state == SEEN) & (scale >= least)
             if seen.any():
-                area = float(np.linalg.norm(_area(surfaces[row])))
-                scores[row].append((-round(float((scale[seen] ** 2).sum()) / len(seen) * area, 3), number))
+                scores[row].append(
+                    (-round(float((scale[seen] ** 2).sum()) / len(seen) * surfaces[row].area, 3), number)
+                )
     return Ranking([[number for _, number in sorted(own)] for own in scores], reached)
-
-
-def _area(surface: Surface) -> Array:
-    a, b, c = surface.corners.swapaxes(0, 1)
-    found: Array = np.cross(b - a, c - a).sum(axis=0) / 2
-    return found
 
 
 def facing(surfaces: Sequence[Surface], cameras: Sequence[Camera]) -> Iterator[tuple[int, Camera, list[int]]]:
