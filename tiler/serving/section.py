@@ -73,17 +73,15 @@ def cut_section(directory: Path, globe: Globe, ends: Array) -> bytes:
         raise InputError("section: from and to are one place, or none of the region; give two")
     rows = _cut_pieces(files, places)
     n = len(rows)
-    if not 0 < n <= MOST_TRIANGLES:
-        raise InputError(
-            f"section: {n:,} triangles, 1 to {MOST_TRIANGLES:,} expected; give places nearer the city"
-        )
+    if not n:
+        raise InputError("section: 0 cells between from and to; give places nearer the city")
     xyz = geocentric(globe.geographic(rows[:, : ROW - 1].reshape(-1, 3)))
     local = np.column_stack(((xyz - xyz[0]).reshape(n, -1), rows[:, -1]))
     return b"".join((xyz[0].astype("<f8").tobytes(), local.astype("<f4").tobytes()))
 
 
 def _cut_pieces(files: RunFiles, places: Array) -> Array:
-    """Give rows (k, `ROW`) of triangles of the pieces that the line meets."""
+    """Give rows (k, `ROW`) of triangles of the pieces that the line meets; InputError if they are too many."""
     x, y, u, v = places.ravel().tolist()
     line, found = shapely.LineString(places), [np.empty((0, ROW))]
     boxes = {name: box for name, box in read_run_record(files.directory / RUN_RECORD).tiles.items() if box}
@@ -97,4 +95,6 @@ def _cut_pieces(files: RunFiles, places: Array) -> Array:
         cut, row = np.unique(cell, return_inverse=True)
         quality = measure_cells(TetMesh(mesh.points, mesh.cells[cut])).radius_ratio
         found.append(np.column_stack((corners.reshape(-1, ROW - 1), quality[row])))
+        if (n := sum(map(len, found))) > MOST_TRIANGLES:
+            raise InputError(f"section: {n:,} triangles or more; bound: {MOST_TRIANGLES:,}; give nearer places")
     return np.concatenate(found)

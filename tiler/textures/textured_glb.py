@@ -61,9 +61,13 @@ def textured_glb(
     views: list[dict[str, Any]] = []
     lists: dict[str, list[dict[str, Any]]] = {"accessors": [], "meshes": [], "nodes": []}
 
+    size = 0
+
     def add_view(raw: bytes, **words: Any) -> int:
-        views.append({"buffer": 0, "byteOffset": sum(map(len, data)), "byteLength": len(raw), **words})
+        nonlocal size
+        views.append({"buffer": 0, "byteOffset": size, "byteLength": len(raw), **words})
         data.append(raw + b"\0" * (-len(raw) % 4))
+        size += len(data[-1])
         return len(views) - 1
 
     def add_rows(rows: NDArray[Any], kind: str, **words: Any) -> int:
@@ -97,14 +101,13 @@ def textured_glb(
         "materials": [_material(f"page {k}", baseColorTexture={"index": k}) for k in range(len(pages))]
         + [_material(name, baseColorFactor=[*COLOURS[marker], 1.0]) for name, marker in PLAIN],
         "bufferViews": views,
-        "buffers": [{"byteLength": sum(map(len, data))}],
+        "buffers": [{"byteLength": size}],
         **lists,
     }
     if pages:
         document["images"], document["samplers"] = images, [{"wrapS": 33071, "wrapT": 33071}]
         document["textures"] = [{"source": k, "sampler": 0} for k in range(len(pages))]
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
-    size = sum(map(len, data))
     if 28 + len(text) + size > MOST_BYTES:
         raise InputError(f"{size} bytes as GLB; bound: {MOST_BYTES}; give a smaller --tile-size")
     return begin_glb(text, size) + b"".join(data)
