@@ -144,7 +144,9 @@ def test_the_page_and_the_tiles_are_there(url: str) -> None:
 
 
 @pytest.mark.parametrize("beside", [-9.0, 9.0])  # a seam, which leaves the box of its tile
-def test_a_section_has_the_cells_of_an_upright_slice(beside: float, url: str, city: Path) -> None:
+def test_a_section_has_the_cells_of_an_upright_slice(
+    beside: float, url: str, city: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     xmin, ymin, xmax, ymax = ask(url, "/city")[1]["bounds"]
     (seam,) = {tile["box"][2] for tile in json.loads((city / "run.json").read_text())["tiles"].values()} - {xmax}
     line = (seam + beside, ymin + 5, seam + beside, ymax - 5)
@@ -160,6 +162,8 @@ def test_a_section_has_the_cells_of_an_upright_slice(beside: float, url: str, ci
     np.testing.assert_allclose(np.frombuffer(data, "<f8", 3) + rows[:, :9].reshape(-1, 3), places, atol=1e-3)
     assert ask(url, "/section?from=1,2&to=1,2,3")[0] == 422
     assert ask(url, "/section?from=1,2,3&to=4e6,2,3")[0] == 422
+    monkeypatch.setattr("tiler.serving.section.MOST_TRIANGLES", 3)
+    assert ask(url, f"/section?{query}")[0] == 422
 
 
 def test_others_need_the_token(small_run: Path, tmp_path: Path) -> None:
