@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.facades.pictures import Picture
+if TYPE_CHECKING:  # a run imports no façades
+    from pipeline.facades.pictures import Picture
 
 # What a face is; outlines are polygons that say where a building stands, without being a part of its surface.
 UNKNOWN, ROOF, GROUND, WALL, OUTLINE = range(5)
@@ -70,7 +71,7 @@ class ModelBuilding:
     kinds: Mapping[str, str] = field(default_factory=dict)
     # Storeys and installations: the building or part of each, by id.
     parents: Mapping[str, str] = field(default_factory=dict)
-    pictures: Sequence[Picture] = ()  # of faces of kind `PICTURED`, in their order
+    pictures: "Sequence[Picture]" = ()  # of faces of kind `PICTURED`, in their order
 
 
 @dataclass

@@ -183,6 +183,9 @@ def _run_config(
 
 
 def _plan(options: argparse.Namespace) -> int:
+    from tiler.executors.dask_settings import GARBAGE
+
+    gc.set_threshold(GARBAGE)
     from tiler.report.plan_report import plan_run
 
     config = make_config(with_file(vars(options)))

@@ -13,7 +13,7 @@ from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.georeference.las_crs import read_las_crs
 from tiler.objects.places import as_place, is_url, place
 from tiler.pointclouds.las_chunks import SLACK, box_of_points
-from tiler.pointclouds.las_header import box_of_header, read_las_header
+from tiler.pointclouds.las_header import box_of_header, has_void_box, read_las_header
 from tiler.store.remembered import remember
 
 # Points that a task reads of a larger file: some seconds, many of those of a task, and few enough for all workers.
@@ -124,7 +124,7 @@ def _read_header(path: Path) -> CloudHeader:
     header = read_las_header(path, evlrs=True)
     stated = read_las_crs(header)
     bounds = box_of_points(path, header)
-    differs = not np.allclose(bounds, box_of_header(header), rtol=0.0, atol=SLACK, equal_nan=True)
+    differs = has_void_box(header) and not np.allclose(bounds, box_of_header(header), rtol=0.0, atol=SLACK)
     units = stated.plan_unit, stated.height_unit
     return CloudHeader(path, header.point_count, bounds, stated.crs, *units, stated.unread, differs)
 

@@ -32,6 +32,16 @@ _MANY_RECORDS = 1_000_000
 _EMPTY_LAZ = 1000  # what follows the header of a LAZ file without points is shorter than this
 
 
+_POINTS = laspy.PointFormat(3)
+
+
+class _Header(laspy.LasHeader):
+    """A header to be filled by `read_from`: laspy makes it with a deep copy of a format, half of the time."""
+
+    def __init__(self) -> None:
+        super().__init__(point_format=_POINTS)
+
+
 def read_las_header(path: Path, *, evlrs: bool = False) -> laspy.LasHeader:
     """Read the header of a LAS, LAZ or COPC file, and refuse what the file cannot hold.
 
@@ -53,7 +63,7 @@ def read_las_header(path: Path, *, evlrs: bool = False) -> laspy.LasHeader:
                 size = file.seek(0, os.SEEK_END)
                 end, n_behind = _check_records(path, file, size)
                 file.seek(0)
-                header = laspy.LasHeader.read_from(file)
+                header = _Header.read_from(file)
                 if evlrs and n_behind <= RECORD_BYTES:
                     header.read_evlrs(file)
                 _check_points(path, header, end - header.offset_to_point_data)

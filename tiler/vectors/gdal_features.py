@@ -132,9 +132,9 @@ def _to_list(column: Any, warned: list[str]) -> list[Any]:
     import pyarrow as pa
 
     if pa.types.is_string(column.type):
-        return [decode_text(value, warned) for value in column.cast(pa.binary()).to_pylist()]
+        return [decode_text(value, warned) for value in column.view(pa.binary()).to_pylist()]
     if pa.types.is_large_string(column.type):
-        return [decode_text(value, warned) for value in column.cast(pa.large_binary()).to_pylist()]
+        return [decode_text(value, warned) for value in column.view(pa.large_binary()).to_pylist()]
     values: list[Any] = column.to_pylist()
     return values
 
