@@ -11,7 +11,7 @@ from pipeline.data.kernel import kernel
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int8)
 NO_MATE, CROWDED = -1, -2
 MOST_CELLS = 2**29 - 1  # four faces each have numbers of 32 bits
-AT_ONCE = 1 << 21  # faces that are dealt out at once
+AT_ONCE = 1 << 20  # faces that are dealt out at once
 
 
 def find_mates(cells: NDArray[np.int32], n_points: int) -> NDArray[np.int32]:

@@ -113,9 +113,10 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
     need(directory, IN_PIECES)
     record = read_run_record(directory / RUN_RECORD)
     if workers:
-        from tiler.executors.dask_settings import start_fork_server
+        from tiler.executors.dask_settings import ENVIRONMENT, FREED, start_fork_server
 
-        start_fork_server()  # which imports what workers need while buildings are read here
+        # It imports what workers need while buildings are read here.
+        start_fork_server(__name__, environment={**ENVIRONMENT, **FREED})
     with (
         TemporaryDirectory(prefix="citystitch-") as folder,
         index_buildings(directory / CITY_MODEL, Path(folder)) as index,

@@ -67,7 +67,10 @@ LOCAL: Mapping[str, Any] = {
     "distributed.scheduler.worker-ttl": None,
     "distributed.deploy.lost-worker-timeout": "3650 days",
 }
-PRELOADED = ("distributed.nanny", "tiler.executors.local_cluster", "tiler.planning.own_stages")
+PRELOADED = ("distributed.nanny", "tiler.executors.local_cluster")
+OF_RUN = "tiler.planning.own_stages"  # imports what tasks of a run need
+# Of workers whose tasks take arrays of many sizes, each a few times: what is freed goes back at once.
+FREED: Mapping[str, int] = {"MALLOC_TRIM_THRESHOLD_": 2**24, "MALLOC_MMAP_THRESHOLD_": 2**19}
 
 
 def as_variables(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -89,13 +92,13 @@ def keep_memory() -> None:
             choose(number, ENVIRONMENT[name])
 
 
-def start_fork_server() -> None:
-    """Start Python's fork server in the background, which imports `PRELOADED` once for all workers here.
+def start_fork_server(module: str = OF_RUN, *, environment: Mapping[str, int] = ENVIRONMENT) -> None:
+    """Start Python's fork server in the background: it imports `PRELOADED` and a module once for all workers.
 
-    A second call does nothing. `ENVIRONMENT` is set in this process, as Dask's nanny does it too.
+    A second call does nothing. `environment` is set in this process, as Dask's nanny does it with `ENVIRONMENT`.
     """
     if METHOD == "forkserver":
-        for name, value in ENVIRONMENT.items():
+        for name, value in environment.items():
             os.environ.setdefault(name, str(value))
-        forkserver.set_forkserver_preload(list(PRELOADED))
+        forkserver.set_forkserver_preload([*PRELOADED, module])
         forkserver.ensure_running()

@@ -44,7 +44,8 @@ def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], work
 
     from tiler.executors.local_cluster import open_cluster
 
-    with open_cluster(workers, Limits(memory=share_memory(workers))) as (client, _):
+    module = getattr(function, "func", function).__module__
+    with open_cluster(workers, Limits(memory=share_memory(workers)), module=module) as (client, _):
         waiting: deque[Any] = deque()
         try:
             for item in items:

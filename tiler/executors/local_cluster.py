@@ -15,7 +15,7 @@ from tiler.config.config import ANYWHERE
 from tiler.engine.executor import Executor
 from tiler.engine.task_limits import REFUSE_AT, Limits, limit_memory, share_memory
 from tiler.executors.dask_executor import DaskExecutor
-from tiler.executors.dask_settings import GARBAGE, LOCAL, start_fork_server
+from tiler.executors.dask_settings import GARBAGE, LOCAL, OF_RUN, start_fork_server
 
 
 class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
@@ -66,9 +66,11 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
 
 
 @contextmanager
-def open_cluster(workers: int, limits: Limits, *, dashboard: str = ANYWHERE) -> Iterator[tuple[Any, Any]]:
-    """Start a scheduler and worker processes, and end them with the context: client and cluster."""
-    start_fork_server()
+def open_cluster(
+    workers: int, limits: Limits, *, dashboard: str = ANYWHERE, module: str = OF_RUN
+) -> Iterator[tuple[Any, Any]]:
+    """Start a scheduler and workers that have a module, and end them with the context: client and cluster."""
+    start_fork_server(module)
     with (
         config.set(dict(LOCAL)),
         LocalCluster(

@@ -1,5 +1,6 @@
 """Pictures of a run's boundary, volume mesh and city model, drawn by VTK without a display (step 3.6)."""
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from pipeline.data.mesh import Marker
 from tiler.pictures.picture_data import City, find_middle, load_air, load_city, load_levels, take_near
-from tiler.pictures.picture_parts import add_air, add_city, add_sizes, plan_edges
+from tiler.pictures.picture_parts import add_air, add_city, add_sizes, blend, plan_edges
 from tiler.pictures.plain_picture import PlainPlotter, has_graphics
 from tiler.store.atomic import replacing
 from tiler.store.kept import IN_PIECES, IN_STORE, need
@@ -43,6 +44,7 @@ OCCLUSION_RADIUS = 20.0
 MOST_SHADED = 10_000.0  # m; in a larger region a house is below a pixel, and the shade is of the terrain's slope
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
+STRIP = 256  # rows of pixels drawn that are kept of those drawn at a time
 SHADE = 16  # places around each pixel drawn that may darken it
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
 LEAST_TRIANGLE = 3.0  # pixels that the middle triangle's edges need in the picture of sizes for lines to be drawn
@@ -216,10 +218,12 @@ def draw_city(
         city = take_near(city, 2 * CLOSE)  # what lies farther off is beside the picture
     if not has_graphics():
         return _draw_plainly(city, size, colours=colours, edges=edges, air=air)
-    with _plotter(size) as plotter:
-        plotter.set_background(SKY[0], top=SKY[1])
-        extent = float(np.ptp(city.points[:, :2], axis=0).max())
-        zoom = max(1.0, extent / CLOSE) if close else 1.0
+    extent = float(np.ptp(city.points[:, :2], axis=0).max())
+    zoom = max(1.0, extent / CLOSE) if close else 1.0
+    # The legend of quality gives the colours as they are.
+    dark = max(OCCLUSION_RADIUS, extent / 100) if extent < MOST_SHADED and colours != "quality" else 0.0
+    beside = SAMPLES * math.ceil(dark / extent * zoom * size[0])
+    with _plotter(size, rows=None if colours == "quality" else STRIP + 2 * beside) as plotter:
         full = round(size[0] * zoom), round(size[1] * zoom)  # pixels that all of it would have
         shown = add_city(plotter, city, full, colours=colours, edges=edges)
         if air is not None:
@@ -234,9 +238,9 @@ def draw_city(
         plotter.camera.position, plotter.camera.focal_point = _aim(shown, size, cut=air is not None)
         plotter.camera.up = (0.0, 0.0, 1.0)
         plotter.reset_camera_clipping_range()
-        if extent < MOST_SHADED and colours != "quality":  # whose colours the legend gives
-            plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=SHADE)
-        return _shoot(plotter)
+        if dark:
+            plotter.enable_ssao(radius=dark, bias=extent / 1500, kernel_size=SHADE)
+        return _shoot_strips(plotter, size[1], beside)
 
 
 def _draw_plainly(city: City, size: tuple[int, int], *, colours: str, edges: bool, air: Any) -> Image:
@@ -310,12 +314,13 @@ def _draw(directory: Path, what: str, size: tuple[int, int], say: Callable[[str]
 
 
 @contextmanager
-def _plotter(size: tuple[int, int]) -> Iterator[Any]:
+def _plotter(size: tuple[int, int], *, rows: int | None = None) -> Iterator[Any]:
+    """Open a plotter that draws a picture of a size (pixels), at most so many rows of pixels drawn at a time."""
     import pyvista
 
     # VTK says aloud that there is no display before it takes the way without one.
     with pyvista.vtk_verbosity("off"):
-        window = [SAMPLES * pixels for pixels in size]
+        window = [SAMPLES * size[0], min(SAMPLES * size[1], rows or SAMPLES * size[1])]
         plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
         plotter.disable_anti_aliasing()  # `SAMPLES` is that; VTK would draw each of its pixels several times
         try:
@@ -328,6 +333,26 @@ def _shoot(plotter: Any) -> Image:
     from PIL import Image as Pictures
 
     return np.asarray(Pictures.fromarray(plotter.screenshot(return_img=True)).reduce(SAMPLES))
+
+
+def _shoot_strips(plotter: Any, n_rows: int, beside: int) -> Image:
+    """Draw a picture of so many rows in strips: VTK takes some 100 bytes for each pixel that it draws at a time.
+
+    `beside`: pixels drawn above and below each strip, which darken it.
+    """
+    whole, drawn, camera = SAMPLES * n_rows, plotter.window_size[1], plotter.camera
+    own = drawn - 2 * beside if drawn < whole else whole
+    camera.view_angle = np.degrees(2 * np.arctan(np.tan(np.radians(camera.view_angle) / 2) * drawn / whole))
+    strips = []
+    for begin in range(0, whole, own):
+        first = min(max(begin - beside, 0), whole - drawn)
+        foot, top = 1 - (first + drawn) / whole, 1 - first / whole  # shares of the height of the picture
+        camera.SetWindowCenter(0.0, (foot + top - 1) * whole / drawn)
+        below, above = blend(np.array([foot, top]), SKY)
+        plotter.set_background(below, top=above)
+        plotter.render()
+        strips.append(_shoot(plotter)[(begin - first) // SAMPLES :][: own // SAMPLES])
+    return np.vstack(strips)
 
 
 def _light(plotter: Any) -> None:
