@@ -147,14 +147,14 @@ def _run_config(
     dashboard: str | None = None,
     report: bool = False,
 ) -> int:
-    from tiler.executors.dask_settings import GARBAGE, keep_memory, start_fork_server
+    from tiler.executors.dask_settings import keep_memory, start_fork_server
     from tiler.store.out_folder import has_record
 
     if config.workers and not config.on_cluster and not has_record(config.out):
         start_fork_server()  # at once, as there is something to do; else with the first task
     elif not config.workers:
         keep_memory()
-    gc.set_threshold(GARBAGE)
+    _collect_seldom()
     from tiler.monitoring.event_log import EventLog
     from tiler.monitoring.events import open_log
     from tiler.monitoring.terminal import make_view, print_last_line, print_summary
@@ -182,10 +182,15 @@ def _run_config(
     return code
 
 
-def _plan(options: argparse.Namespace) -> int:
+def _collect_seldom() -> None:
+    """Look for cycles of objects seldom: imports and tasks leave next to none."""
     from tiler.executors.dask_settings import GARBAGE
 
     gc.set_threshold(GARBAGE)
+
+
+def _plan(options: argparse.Namespace) -> int:
+    _collect_seldom()
     from tiler.report.plan_report import plan_run
 
     config = make_config(with_file(vars(options)))
@@ -274,6 +279,7 @@ def _serve(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
+    _collect_seldom()
     from tiler.report.write import write_report
 
     refuse_strangers(options.directory)

@@ -44,7 +44,8 @@ OCCLUSION_RADIUS = 20.0
 MOST_SHADED = 10_000.0  # m; in a larger region a house is below a pixel, and the shade is of the terrain's slope
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
-STRIP = 256  # rows of pixels drawn that are kept of those drawn at a time
+STRIP = 128  # rows of pixels drawn that are kept of those drawn at a time
+BLURRED = 4
 SHADE = 16  # places around each pixel drawn that may darken it
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
 LEAST_TRIANGLE = 3.0  # pixels that the middle triangle's edges need in the picture of sizes for lines to be drawn
@@ -144,7 +145,7 @@ def render_run(
     -----
     The camera follows from the region alone, but VTK samples the shade between buildings at random: two pictures
     of one run differ in some pixels.
-    Memory is bounded: most of it is VTK's, some 100 bytes for each pixel drawn. Facets beyond
+    Memory is bounded: 260 MiB for libraries, and some 100 bytes for each pixel drawn at a time. Facets beyond
     `picture_data.MOST_FACETS` are made coarser, and what is shown cell by cell, ``"mesh"``, ``"overview"`` and
     ``"sizes"``, is the middle of a larger region (`find_middle`).
     Edges fade out as triangles get small on the picture. Everything is moved to the origin first,
@@ -223,7 +224,7 @@ def draw_city(
     # The legend of quality gives the colours as they are.
     dark = max(OCCLUSION_RADIUS, extent / 100) if extent < MOST_SHADED and colours != "quality" else 0.0
     beside = SAMPLES * math.ceil(dark / extent * zoom * size[0])
-    with _plotter(size, rows=None if colours == "quality" else STRIP + 2 * beside) as plotter:
+    with _plotter(size, rows=None if colours == "quality" else 2 * beside + max(STRIP, 2 * beside)) as plotter:
         full = round(size[0] * zoom), round(size[1] * zoom)  # pixels that all of it would have
         shown = add_city(plotter, city, full, colours=colours, edges=edges)
         if air is not None:
@@ -338,21 +339,23 @@ def _shoot(plotter: Any) -> Image:
 def _shoot_strips(plotter: Any, n_rows: int, beside: int) -> Image:
     """Draw a picture of so many rows in strips: VTK takes some 100 bytes for each pixel that it draws at a time.
 
-    `beside`: pixels drawn above and below each strip, which darken it.
+    `beside`: pixels drawn above and below each strip, which darken it. VTK blurs the shade, and takes what is at
+    the other end of what it draws for what is beyond an end: so `BLURRED` rows are drawn beyond the picture.
     """
     whole, drawn, camera = SAMPLES * n_rows, plotter.window_size[1], plotter.camera
+    beyond = min(beside, BLURRED) if drawn < whole else 0
     own = drawn - 2 * beside if drawn < whole else whole
     camera.view_angle = np.degrees(2 * np.arctan(np.tan(np.radians(camera.view_angle) / 2) * drawn / whole))
     strips = []
     for begin in range(0, whole, own):
-        first = min(max(begin - beside, 0), whole - drawn)
+        first = min(max(begin - beside, -beyond), whole - drawn + beyond)
         foot, top = 1 - (first + drawn) / whole, 1 - first / whole  # shares of the height of the picture
         camera.SetWindowCenter(0.0, (foot + top - 1) * whole / drawn)
         below, above = blend(np.array([foot, top]), SKY)
         plotter.set_background(below, top=above)
         plotter.render()
         strips.append(_shoot(plotter)[(begin - first) // SAMPLES :][: own // SAMPLES])
-    return np.vstack(strips)
+    return np.vstack(strips)[:n_rows]
 
 
 def _light(plotter: Any) -> None:
