@@ -12,8 +12,8 @@ from tiler.config.config import Config, make_config
 from tiler.config.config_file import with_file
 from tiler.editing.requests import (
     Asked,
+    describe_uploads,
     edit_buildings,
-    find_unused_heights,
     make_edit,
     read_buildings,
     read_date,
@@ -48,14 +48,14 @@ class Outcome:
         What ``run.json`` holds now.
     files : int
         Files of the folder that changed.
-    unused : tuple of str
-        Buildings whose uploaded height does not count, as roof points in the cloud tell theirs.
+    told : tuple of str
+        What to know of its uploads: roof points in the cloud that do not count, a foot off the ground.
     """
 
     edit: Edit
     record: dict[str, Any]
     files: int
-    unused: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -216,12 +216,11 @@ def _mesh(
                 f"edit of {names}: tile {lost[0]} cannot be meshed with it "
                 f"({made['missing'][lost[0]]['reason']}); the city is as before"
             )
-        unused = [tuple(find_unused_heights(work, edit)) for edit in edits]
-        if any(unused):
-            names = ", ".join(name for some in unused for name in some)
-            say(f"roof points in the cloud give the height, not the upload: {names}")
+        told = [tuple(describe_uploads(work, edit)) for edit in edits]
         files = commit(city.directory)
-        return [Outcome(edit, made, files, some) for edit, some in zip(edits, unused, strict=True)]
+        for sentence in (one for some in told for one in some):
+            say(sentence)
+        return [Outcome(edit, made, files, some) for edit, some in zip(edits, told, strict=True)]
     finally:
         forget(city.directory)
 

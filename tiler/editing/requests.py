@@ -2,17 +2,14 @@
 
 import datetime
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
-
-from pipeline.city_model.heights import ROOF_SOURCES
-from pipeline.data.citymodel import Footprints
 from pipeline.data.errors import ConfigError, InputError
-from tiler.editing.uploads import as_outlines
+from tiler.editing.uploads import Uploaded, as_outlines
 from tiler.engine.stage import REGION_ITEM
+from tiler.engine.task import notes_from_json
 from tiler.store.edit_journal import Box, Edit, add_up
 from tiler.store.out_folder import STORE
 from tiler.store.store import Store
@@ -30,7 +27,7 @@ class Asked:
         One of `ACTIONS`.
     building : str
         Id of the building; ``""`` to add those of the upload.
-    upload : Footprints or None
+    upload : Uploaded or None
         What comes.
     source : str
         Name of its file.
@@ -44,7 +41,7 @@ class Asked:
 
     action: str
     building: str = ""
-    upload: Footprints | None = None
+    upload: Uploaded | None = None
     source: str = ""
     date: str = ""
     base: int | None = None
@@ -77,17 +74,18 @@ def edit_buildings(given: Mapping[str, Box], journal: Sequence[Edit]) -> dict[st
     found, edits = dict(given), add_up(journal)
     for name, _ in edits.removed:
         found.pop(name, None)
-    return found | {outline[0]: box for outline, box in edits.outlines}
+    return found | {outline.id: box for outline, box in edits.outlines}
 
 
-def find_unused_heights(out: Path, edit: Edit) -> list[str]:
-    """List the buildings whose uploaded height does not count, as roof points in the cloud tell theirs."""
-    given = [name for name, _, height, _ in edit.outlines if height is not None]
-    store, found = Store(out / STORE), set[str]()
-    for tile in store.names("houses") if given else []:
-        arrays, _ = store.read("houses", tile, names=("full_id", "full_roof_source"))
-        found |= set(arrays["full_id"][arrays["full_roof_source"] == ROOF_SOURCES.index("points")].tolist())
-    return sorted(found.intersection(given))
+def describe_uploads(out: Path, edit: Edit) -> list[str]:
+    """Say what to know of uploads that tell their height: points that do not count, a foot off the ground."""
+    ids = {outline.id for outline in edit.outlines if outline.tells}
+    store, found = Store(out / STORE), list[str]()
+    for tile in store.names("houses") if ids else []:
+        notes = notes_from_json(store.attributes("houses", tile)["notes"])
+        told = (note for note in notes if note.subject in ids and note.kind.startswith(("upload-", "model-")))
+        found += [f"{note.subject}: {note.detail}" for note in told]
+    return sorted(found)
 
 
 def read_date(text: str) -> str:
@@ -127,9 +125,9 @@ def make_edit(asked: Asked, *, buildings: Mapping[str, Box], journal: Sequence[E
             f"base {base}: the last edit is number {last}; give one up to it, the list of edits tells all"
         )
     if action == "replace" and upload is not None:
-        upload = replace(upload, ids=np.full(len(upload.ids), name))
+        upload = upload.with_ids(name)
     outlines, boxes = ((), ()) if upload is None else as_outlines(upload)
-    ids = {name} if action != "add" else {outline[0] for outline in outlines}
+    ids = {name} if action != "add" else {outline.id for outline in outlines}
     _refuse_conflicts(ids, journal, date, last if base is None else base)
     if action == "add":
         if there := sorted(ids.intersection(buildings)):

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +10,11 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.citymodel import Footprints, take_footprints
+from pipeline.data.citymodel import Footprints
 from pipeline.data.errors import InputError
 from pipeline.data.roofs import take_roofs
 from tiler.cityinput.faces import ModelBuilding
-from tiler.cityinput.rows import ModelRows, make_rows
+from tiler.cityinput.rows import ModelRows, make_rows, take_rows
 from tiler.cityinput.sources import frame_of, read_model_header, scan_model
 from tiler.config.config import Config
 from tiler.editing.glb_uploads import MAGIC, read_glb
@@ -23,7 +23,7 @@ from tiler.footprints.footprint_source import open_source
 from tiler.georeference.crs import parse_crs, same_crs
 from tiler.georeference.frame import Frame
 from tiler.objects.places import is_missing
-from tiler.store.edit_journal import Box, Outline
+from tiler.store.edit_journal import Box, Outline, Surface
 from tiler.vectors.layers import describe_layer
 
 # Notes that say that a feature is not what it should be: of a file of a city it is left out, an edit is refused.
@@ -33,6 +33,7 @@ REFUSED = {
 }
 SAMPLES = 64  # along each side of the box of a building, where the heights of its roof are averaged
 EAST_NORTH = Frame((0, 1.0), (1, 1.0))
+HEIGHT = "height"  # attribute of heights above ground (m), where the run was told of none
 HEAD = 2**20  # bytes of a file within which it says that it is CityJSON
 
 
@@ -44,15 +45,27 @@ class Upload:
     position: Sequence[float] | None = None
 
 
-def read_upload(upload: Upload, config: Config, *, crs: str, bounds: Box) -> Footprints:
+@dataclass(frozen=True, eq=False)
+class Uploaded:
+    """What an uploaded file has, by id: footprints, and of a city model the roof surfaces of each, else None."""
+
+    footprints: Footprints
+    models: ModelRows | None = None
+
+    def with_ids(self, name: str) -> "Uploaded":
+        """Give all footprints the id of a building."""
+        n = len(self.footprints.ids)
+        return replace(self, footprints=replace(self.footprints, ids=np.full(n, name)))
+
+
+def read_upload(upload: Upload, config: Config, *, crs: str, bounds: Box) -> Uploaded:
     """Read the footprints of an uploaded file.
 
     Parameters
     ----------
     upload : Upload
         Any vector file that `citystitch run` takes as footprints; ids, heights and roofs from the same attributes.
-        Or CityJSON, or a sequence of it: outlines, and mean heights of roofs above the lowest place of each; or
-        one building as GLB.
+        Or CityJSON, or a sequence of it, or one building as GLB: outlines and roof surfaces.
     config : Config
         Parameters of the run that is edited.
     crs : str
@@ -62,8 +75,9 @@ def read_upload(upload: Upload, config: Config, *, crs: str, bounds: Box) -> Foo
 
     Returns
     -------
-    Footprints
-        One or more, by id.
+    Uploaded
+        One or more footprints. Those of models have mean heights of roofs above the lowest place of each, which
+        count where roofs are flat.
 
     Raises
     ------
@@ -75,20 +89,21 @@ def read_upload(upload: Upload, config: Config, *, crs: str, bounds: Box) -> Foo
         raise InputError(f"{path}: no such file; check the path of the upload")
     start = _read_start(path)
     if start.startswith(MAGIC):
-        return _check(path, _take_models(path, [read_glb(path, position)], EAST_NORTH), bounds)
+        return _take_models(path, [read_glb(path, position)], EAST_NORTH, bounds)
     if position is not None:
         raise InputError(f"{path}: is no GLB file, and other files say where they stand; leave the position out")
     if start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"{" and b'"CityJSON' in start:
-        return _check(path, _read_model(path, crs), bounds)
+        return _read_model(path, crs, bounds)
     layer = describe_layer(path)
     # An upload may say less than the file of the city: what has no height takes that of the points.
-    names = {name: name if name in layer.fields else "" for name in (config.height_attribute, config.id_attribute)}
+    heights = config.height_attribute or HEIGHT
+    names = {name: name if name in layer.fields else "" for name in (heights, config.id_attribute)}
     source = open_source(
         path,
         crs=pyproj.CRS.from_user_input(crs),
         bounds=bounds,
         id_attribute=names[config.id_attribute],
-        height_attribute=names[config.height_attribute],
+        height_attribute=names[heights],
         roof_attribute=config.roof_attribute if config.roof_attribute in layer.fields else "",
     )
     found = list(scan_footprints(source))
@@ -102,7 +117,7 @@ def read_upload(upload: Upload, config: Config, *, crs: str, bounds: Box) -> Foo
             f"{path}: {n} of {layer.n_features} features meet the region "
             f"({', '.join(f'{value:.10g}' for value in bounds)}, {crs}); check their place and CRS"
         )
-    return _check(path, join_footprints(rows, bounds), bounds)
+    return Uploaded(_check(path, join_footprints(rows, bounds), bounds))
 
 
 def _read_start(path: Path) -> bytes:
@@ -113,15 +128,15 @@ def _read_start(path: Path) -> bytes:
         return b""
 
 
-def _read_model(path: Path, crs: str) -> Footprints:
+def _read_model(path: Path, crs: str, bounds: Box) -> Uploaded:
     """Read the buildings of CityJSON; one without a CRS is in that of the region."""
     header = read_model_header(path)
     is_other = header.crs is not None and not same_crs(header.crs, parse_crs(crs))
     buildings = [one for one in scan_model(path) if isinstance(one, ModelBuilding)]
-    return _take_models(path, buildings, frame_of(header, crs if is_other else ""))
+    return _take_models(path, buildings, frame_of(header, crs if is_other else ""), bounds)
 
 
-def _take_models(path: Path, buildings: Sequence[ModelBuilding], frame: Frame) -> Footprints:
+def _take_models(path: Path, buildings: Sequence[ModelBuilding], frame: Frame, bounds: Box) -> Uploaded:
     rows, notes = make_rows(buildings, frame, "auto", Counter())
     for note in notes:
         if note.kind in REFUSED:
@@ -130,9 +145,9 @@ def _take_models(path: Path, buildings: Sequence[ModelBuilding], frame: Frame) -
     for name, some in zip(rows.ids, parts, strict=True):
         if len(some) != 1:
             raise InputError(f"{path}: {name} stands in {len(some)} places; make a building of each")
-    polygons = np.array([shapely.force_2d(some[0]) for some in parts], np.object_)
-    order = np.argsort(rows.ids, kind="stable")
-    return take_footprints(Footprints(polygons, rows.ids, _mean_tops(rows)), order)
+    rows = take_rows(rows, np.argsort(rows.ids, kind="stable"))
+    polygons = np.array([shapely.force_2d(shapely.get_geometry(one, 0)) for one in rows.outlines], np.object_)
+    return Uploaded(_check(path, Footprints(polygons, rows.ids, _mean_tops(rows)), bounds), rows)
 
 
 def _mean_tops(rows: ModelRows) -> NDArray[np.float64]:
@@ -169,19 +184,42 @@ def _check(path: Path, footprints: Footprints, bounds: Box) -> Footprints:
     return footprints
 
 
-def as_outlines(footprints: Footprints) -> tuple[tuple[Outline, ...], tuple[Box, ...]]:
+def as_outlines(uploaded: Uploaded) -> tuple[tuple[Outline, ...], tuple[Box, ...]]:
     """Write footprints as an edit keeps them, and the box of each (m)."""
-    blobs = shapely.to_wkb(footprints.polygons, hex=True, output_dimension=2, byte_order=1)
+    footprints, models = uploaded.footprints, uploaded.models
     outlines = tuple(
-        (str(name), str(blob), None if np.isnan(height) else float(height), _form(form.tolist()))
-        for name, blob, height, form in zip(
-            footprints.ids, blobs, footprints.given_height, footprints.forms, strict=True
+        Outline(name, blob, _number(height), _form(form), *(_roof_of(models, k) if models is not None else ()))
+        for k, (name, blob, height, form) in enumerate(
+            zip(
+                footprints.ids.tolist(),
+                _as_text(footprints.polygons),
+                footprints.given_height.tolist(),
+                footprints.forms.tolist(),
+                strict=True,
+            )
         )
     )
     boxes = shapely.bounds(footprints.polygons).reshape(-1, 4).tolist()
     return outlines, tuple((xmin, ymin, xmax, ymax) for xmin, ymin, xmax, ymax in boxes)
 
 
+def _roof_of(models: ModelRows, row: int) -> tuple[float | None, tuple[Surface, ...]]:
+    """Lowest height and roof surfaces of a building."""
+    own = slice(models.start[row], models.start[row + 1])
+    planes = np.column_stack((models.roofs.plane, models.roofs.origin, models.roofs.limits))[own]
+    surfaces = zip(_as_text(models.surfaces[own]), map(tuple, planes.tolist()), strict=True)
+    return _number(models.base[row]), tuple(surfaces)
+
+
+def _as_text(polygons: NDArray[np.object_]) -> list[str]:
+    blobs: list[str] = shapely.to_wkb(polygons, hex=True, output_dimension=2, byte_order=1).tolist()
+    return blobs
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
 def _form(values: list[float]) -> tuple[float | None, ...]:
-    form = tuple(None if np.isnan(value) else value for value in values)
+    form = tuple(map(_number, values))
     return () if form == (None,) * len(form) else form

@@ -16,11 +16,10 @@ import pyproj
 import shapely
 from pyproj.exceptions import CRSError
 
-from pipeline.data.citymodel import Footprints
 from pipeline.data.errors import InputError
 from tiler.editing.edit import City
 from tiler.editing.requests import ACTIONS, Asked, read_date
-from tiler.editing.uploads import Upload, read_upload
+from tiler.editing.uploads import Upload, Uploaded, read_upload
 
 MOST_BYTES = 2**20  # of a body
 TEXT = {"type": "string", "minLength": 1, "maxLength": 200}
@@ -131,11 +130,13 @@ def _write_glb(body: Mapping[str, Any], city: City, folder: Path) -> Path:
     return path
 
 
-def _name(upload: Footprints, body: Mapping[str, Any]) -> Footprints:
+def _name(upload: Uploaded, body: Mapping[str, Any]) -> Uploaded:
     """Give buildings the id of a body, and footprints its height."""
-    n = len(upload.ids)
-    height = np.full(n, body.get("height", np.nan), np.float64) if "footprint" in body else upload.given_height
-    return replace(upload, ids=np.full(n, body["building"]), given_height=height)
+    named = upload.with_ids(body["building"])
+    if "footprint" not in body:
+        return named
+    height = np.full(len(named.footprints.ids), body.get("height", np.nan), np.float64)
+    return replace(named, footprints=replace(named.footprints, given_height=height))
 
 
 WRITERS = {"footprint": _write_footprint, "cityjson": _write_model, "glb": _write_glb}

@@ -142,7 +142,7 @@ def describe_edit(edit: Edit) -> dict[str, Any]:
 def describe_outcome(outcome: Outcome) -> dict[str, Any]:
     """Describe an edit that is done just now."""
     tasks = outcome.record["tasks"]
-    more = {"heights_of_roof_points": list(outcome.unused), "ran": tasks["ran"], "tasks": tasks["all"]}
+    more = {"notes": list(outcome.told), "ran": tasks["ran"], "tasks": tasks["all"]}
     return describe_edit(outcome.edit) | more
 
 

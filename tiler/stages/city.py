@@ -1,6 +1,7 @@
 """Stages 1.4 to 2.3: houses of each tile, clusters of close ones across tiles, and the simplified city model."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import reach_of_points
-from pipeline.city_model.city import City, CityOptions
+from pipeline.city_model.city import City, CityOptions, find_places
 from pipeline.city_model.city_steps import measure_city, prepare_footprints
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.houses import (
@@ -38,6 +39,7 @@ from pipeline.roofs.roof_points import (
     locate_roof_points,
     merge_roof_points,
 )
+from pipeline.roofs.roof_surfaces import RoofSurfaces
 from pipeline.simplification.house_clusters import (
     Shapes,
     find_close,
@@ -49,6 +51,7 @@ from pipeline.simplification.house_clusters import (
 from pipeline.simplification.reduced_detail import BLOCK, reduce_detail
 from pipeline.simplification.simplify import raise_buildings
 from stitch.tiling.grid import Key
+from tiler.cityinput.rows import ModelRows
 from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.citymodels.tables import (
     ARRAYS_TO_RAISE,
@@ -76,13 +79,21 @@ from tiler.config.zones import LEVELS, Zones
 from tiler.engine.run_context import find_owned, region_around, tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Result, Task
-from tiler.stages.city_files import count_feet, note_feet, read_surfaces
+from tiler.stages.city_files import (
+    count_feet,
+    find_rows,
+    note_feet,
+    read_surfaces,
+    read_uploads,
+    take_surfaces,
+)
 from tiler.stages.house_points import add_unmarked, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.readers import extent_of, grow, hull, read_known_terrain, read_own_outlines
 from tiler.store.run_folder import PARTS
 
 TERRAIN = ("dtm_spacing", "ground_filter")
+OF_UPLOADS = "uploads"  # fact of the houses of a tile where uploads tell some roofs, of which ``told`` is an array
 OF_BLOCKS = ("block", "block_place")  # arrays of the houses: level and point of those that are blocks
 
 
@@ -187,6 +198,8 @@ def make_houses(task: Task) -> Facts:
         around = hull(task.box, extent_of(read.polygons))
         inner, notes = prepare_footprints(read, region_around(grid, around), options)
         own = _owned(task, inner)
+        uploads = read_uploads(task)
+        told = find_rows(uploads, own.polygons, own.ids) >= 0  # roof points there are of what stood there before
     places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
     task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
     extent = extent_of(own.polygons)
@@ -196,21 +209,15 @@ def make_houses(task: Task) -> Facts:
     terrain = cut_terrain(dtm, window_of(dtm))
     with task.step("1.5 extract building points"):
         roofs = locate_roof_points(cloud, own.polygons, building_class=True)
-        roofs, unmarked = add_unmarked(task, own, roofs, cloud, terrain)
+        roofs, unmarked = add_unmarked(task, own, roofs, cloud, terrain, told=told)
         blocks = task.parameters.get("blocks_given", False)
-        roofs = leave_out_points(roofs, find_blocks(own.forms)[0] >= 0) if blocks else roofs
+        roofs, stated = _leave_out_stated(task, own, roofs, told, blocks=blocks)
     city = measure_city(cloud, own, terrain, options, building_class=True, roofs=roofs, trace=task.step)
-    task.notes(_of_buildings(city.notes, own.ids[find_blocks(own.forms)[0] >= 0]))
+    task.notes(_of_buildings(city.notes, own.ids[stated]))
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
     others = np.isin(city.model.ids, own.ids[unmarked])
-    surfaces, feet = None, {}
-    if task.parameters.get("buildings_given", False):
-        with task.step("1.2 roof surfaces"):
-            surfaces, base = read_surfaces(task, city.model.polygons, city.model.ids)
-        if not task.parameters.ground_of_models:
-            houses_of = Footprints(city.model.polygons, city.model.ids, city.given_height)
-            task.notes(note_feet(houses_of, base, city.model.ground))
-            feet = {"feet": count_feet(base, city.model.ground)}
+    told = told[np.isin(own.ids, city.model.ids)]
+    surfaces, facts = _find_surfaces(task, city, uploads)
     with task.step("2.0 split levels"):
         houses = divide_houses(
             city,
@@ -218,7 +225,7 @@ def make_houses(task: Task) -> Facts:
             options,
             building_class=True,
             roofs=roofs,
-            unmarked=others,
+            unmarked=others | told,
             surfaces=surfaces,
             prefer_points=task.parameters.get("prefer", "model") == "points",
         )
@@ -231,10 +238,45 @@ def make_houses(task: Task) -> Facts:
     if blocks:
         level, place = find_blocks(city.forms)
         task.put(block=level, block_place=place)
+    if told.any():
+        task.put(told=told)
+        facts[OF_UPLOADS] = True
     parts = {"house parts": len(houses.parts.polygons)}
     counts = {"buildings before merging": len(houses), **parts, **_count_forms(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
-    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts, **feet}
+    counts |= {"roofs of uploads": int(told.sum())} if told.any() else {}
+    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts, **facts}
+
+
+def _leave_out_stated(
+    task: Task, own: Footprints, roofs: RoofPoints, told: NDArray[np.bool_], *, blocks: bool
+) -> tuple[RoofPoints, NDArray[np.bool_]]:
+    """Leave out the roof points of blocks, and of houses whose upload tells the roof; gives these, too."""
+    n = np.diff(roofs.start)
+    task.notes(
+        Note("upload-instead-of-points", *place, f"{n[k]} roof points in the cloud do not count")
+        for k, place in find_places(own, told & (n > 0))
+    )
+    stated = told | (find_blocks(own.forms)[0] >= 0)
+    return leave_out_points(roofs, stated if blocks else told), stated
+
+
+def _find_surfaces(task: Task, city: City, uploads: ModelRows) -> tuple[RoofSurfaces | None, Facts]:
+    """Find the roof surfaces of houses in city models or uploads, and note feet that are off the ground."""
+    of_models = task.parameters.get("buildings_given", False)
+    with task.step("1.2 roof surfaces") if of_models or len(uploads) else nullcontext():
+        if of_models:
+            surfaces, base = read_surfaces(task, city.model.polygons, city.model.ids)
+        elif len(uploads):
+            rows = find_rows(uploads, city.model.polygons, city.model.ids)
+            surfaces, base = take_surfaces(uploads, rows)
+        else:
+            return None, {}
+    if of_models and task.parameters.ground_of_models:
+        return surfaces, {}
+    houses_of = Footprints(city.model.polygons, city.model.ids, city.given_height)
+    task.notes(note_feet(houses_of, base, city.model.ground))
+    return surfaces, {"feet": count_feet(base, city.model.ground)} if of_models else {}
 
 
 def _of_buildings(notes: Sequence[Note], blocks: NDArray[np.str_]) -> list[Note]:
@@ -363,14 +405,17 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     with task.step("2.3 roof points"):
         roofs = locate_roof_points(cloud, shapes.polygons, building_class=True)
         del cloud
-        rows = _find_unmarked(shapes, gathered)
+        rows = _find_of_all(shapes, gathered, gathered.unmarked)
         others = find_surfaces(task, shapes.polygons[rows], terrain, MAY_BE_ROOF)
         roofs = add_roof_points(roofs, rows, others.points)
+        told = np.zeros(len(shapes), np.bool_)
+        told[_find_of_all(shapes, gathered, gathered.told)] = True
+        roofs = leave_out_points(roofs, told)
     city = raise_buildings(
         gathered.houses, shapes, terrain, options, reserved=reserved, roof_points=roofs, trace=task.step
     )
-    of_blocks = gathered.houses.ids[gathered.block >= 0]
-    task.notes(_of_buildings(city.notes, city.model.ids[np.isin(city.model.house, of_blocks)]))
+    stated = gathered.houses.ids[gathered.told | (gathered.block >= 0)]
+    task.notes(_of_buildings(city.notes, city.model.ids[np.isin(city.model.house, stated)]))
     kept = np.zeros(len(shapes), np.bool_)
     kept[city.row] = True
     roofs = keep_roof_points(roofs, kept)
@@ -448,11 +493,11 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
     return take_footprints(footprints, mine)
 
 
-def _find_unmarked(shapes: Shapes, gathered: "_Gathered") -> NDArray[np.int64]:
-    """Rows of the buildings whose houses are all unmarked."""
-    unmarked = gathered.unmarked[gathered.houses.parts.house[shapes.member]]
+def _find_of_all(shapes: Shapes, gathered: "_Gathered", house: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rows of the buildings for all of whose houses something holds, (h,)."""
+    holds = house[gathered.houses.parts.house[shapes.member]]
     building = np.repeat(np.arange(len(shapes)), np.diff(shapes.member_start))
-    return np.flatnonzero(np.bincount(building[~unmarked], minlength=len(shapes)) == 0)
+    return np.flatnonzero(np.bincount(building[~holds], minlength=len(shapes)) == 0)
 
 
 def _terrain_around(task: Task, extent: Box | None, reach: float) -> Dtm:
@@ -484,7 +529,7 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
     """Read some arrays of the houses of the tile's clusters, by ascending id."""
     house, cluster, changed = (members.arrays[name] for name in ("house", "cluster", "changed"))
     several, order, other = [], [], [np.empty(0, np.bool_)]
-    level, at = [np.empty(0, np.int8)], [np.empty((0, 2))]
+    level, at, told = [np.empty(0, np.int8)], [np.empty((0, 2))], [np.empty(0, np.bool_)]
     for result in task.read("houses", (*arrays, "unmarked")):
         mine = np.flatnonzero((house[:, :2] == tile_key(result.name)).all(axis=1))
         several.append(take_houses(unpack_houses(result.arrays), house[mine, 2]))
@@ -493,6 +538,9 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
         n = len(result.arrays["unmarked"])
         level.append(result.arrays.get("block", np.full(n, -1, np.int8))[house[mine, 2]])
         at.append(result.arrays.get("block_place", np.full((n, 2), np.nan))[house[mine, 2]])
+        uploads = result.facts.get(OF_UPLOADS, False)
+        by_upload = task.read_rows("houses", result.name, "told", 0, n) if uploads else np.zeros(n, np.bool_)
+        told.append(by_upload[house[mine, 2]])
     rows = np.concatenate([np.empty(0, np.int64), *order])
     joined = join_houses(several)
     by_id = np.argsort(joined.ids, kind="stable")
@@ -508,6 +556,7 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
         np.concatenate(other)[by_id],
         np.concatenate(level)[by_id],
         np.concatenate(at)[by_id],
+        np.concatenate(told)[by_id],
     )
 
 
@@ -516,7 +565,8 @@ class _Gathered:
     """Houses of a tile's clusters, and whether roofs are of other classes than that of buildings.
 
     ``place`` (p, 4) holds of each part its house's tile, row there, and number; ``block`` (h,) and ``block_place``
-    (h, 2) level and point (m) of the houses that are blocks, -1 and NaN for others.
+    (h, 2) level and point (m) of the houses that are blocks, -1 and NaN for others; ``told`` (h,) those whose
+    upload tells their roof.
     """
 
     houses: Houses
@@ -526,6 +576,7 @@ class _Gathered:
     unmarked: NDArray[np.bool_]
     block: NDArray[np.int8]
     block_place: NDArray[np.float64]
+    told: NDArray[np.bool_]
 
 
 def _earlier_shapes(task: Task, gathered: _Gathered) -> Shapes:

@@ -1,9 +1,10 @@
 """What stages make of city models and terrain rasters: points, footprints, roof surfaces, heights of nodes."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -12,25 +13,27 @@ from numpy.typing import NDArray
 from pipeline.city_model.city import find_places
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
-from pipeline.data.roofs import take_roofs
+from pipeline.data.roofs import Roofs, take_roofs
 from pipeline.points_terrain.raster import Dtm, NodeWindow
 from pipeline.roofs.roof_surfaces import RoofSurfaces, no_surfaces
 from tiler.cityinput.lattices import Cells, interpolate_cells
 from tiler.cityinput.model_blocks import UNIT, Wanted, pack_points, read_model_blocks
 from tiler.cityinput.rasters import HEIGHT_UNIT, Lattice, find_lattice, read_raster
 from tiler.cityinput.row_arrays import OF_CELL, RowPacker, unpack_rows
-from tiler.cityinput.rows import ModelRows, join_rows
+from tiler.cityinput.rows import ModelRows, join_rows, no_rows
 from tiler.cityinput.sources import MODEL, TERRAIN
 from tiler.engine.stage import Box, Facts
 from tiler.engine.task import Task
 from tiler.georeference.frame import origin_of
 from tiler.pointclouds.cells import ranges_near
 from tiler.stages.readers import extent_of, read_units_of
+from tiler.store.edit_journal import Outline
 
 # Parameters of a run that decide what is read of a city model.
 MODEL_PARAMETERS = ("lod", "height_attribute", "points_of_models", "ground_of_models", "shift_z")
 OFF_GROUND = 5.0  # m; a house whose foot is farther from the ground is told
 SHIFTED = 2.0  # m; a median of all from which on they are told together
+UPLOADED = "uploaded_"  # what the names of arrays of uploaded buildings begin with
 BAND = 20_000  # rows of buildings in memory at a time
 
 
@@ -168,24 +171,65 @@ def read_surfaces(
     if extent is None:
         return no_surfaces(0), np.empty(0)
     rows = join_rows([_rows_near(task, name, facts, extent) for name, facts in list_kind(task, MODEL)])
+    return take_surfaces(rows, find_rows(rows, polygons, ids))
+
+
+def take_surfaces(rows: ModelRows, row: NDArray[np.int64]) -> tuple[RoofSurfaces, NDArray[np.float64]]:
+    """Take the roof surfaces of houses, and how low they reach, by the rows of `find_rows`."""
+    of_house = [np.arange(rows.start[k], rows.start[k + 1]) if k >= 0 else np.empty(0, np.int64) for k in row]
+    chosen = np.concatenate([np.empty(0, np.int64), *of_house])
+    start = np.cumsum([0, *map(len, of_house)])
+    base = np.append(rows.base, np.nan)[row]
+    return RoofSurfaces(start, rows.surfaces[chosen], take_roofs(rows.roofs, chosen)), base
+
+
+def find_rows(rows: ModelRows, polygons: NDArray[np.object_], ids: NDArray[np.str_]) -> NDArray[np.int64]:
+    """Find the building that each house is, by its id and its place; -1 for none."""
     by_id: dict[str, list[int]] = {}
     for k, one in enumerate(rows.ids.tolist()):
         by_id.setdefault(one, []).append(k)
-    count, surface = [0], [np.empty(0, np.int64)]
-    base = np.full(len(ids), np.nan)
-    for k, (one, polygon) in enumerate(zip(ids.tolist(), polygons, strict=True)):
-        candidates = by_id.get(one) or by_id.get(one.rpartition("-")[0]) or []
-        best = _choose(rows, candidates, polygon)
-        own = np.empty(0, np.int64) if best is None else np.arange(rows.start[best], rows.start[best + 1])
-        base[k] = np.nan if best is None else rows.base[best]
-        count.append(len(own))
-        surface.append(own)
-    chosen = np.concatenate(surface)
-    return RoofSurfaces(np.cumsum(count), rows.surfaces[chosen], take_roofs(rows.roofs, chosen)), base
+    found = np.full(len(ids), -1)
+    for k, (one, polygon) in enumerate(zip(ids.tolist(), polygons, strict=True) if by_id else ()):
+        found[k] = _choose(rows, by_id.get(one) or by_id.get(one.rpartition("-")[0]) or [], polygon)
+    return found
 
 
-def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) -> int | None:
-    """Row of the building that is a house: of several of one id the one over it, then by level; None for none."""
+def pack_uploads(outlines: Sequence[Outline]) -> dict[str, NDArray[Any]]:
+    """Give the arrays of uploaded buildings that tell their height, as of city models; none where none does."""
+    told = [one for one in outlines if one.tells]
+    if not told:
+        return {}
+    surface = [each for one in told for each in one.surfaces]
+    plane = np.array([values for _, values in surface], np.float64).reshape(-1, 7)
+    rows = ModelRows(
+        shapely.from_wkb([one.polygon for one in told]).astype(object),
+        np.array([one.id for one in told], np.str_),
+        np.array([one.height for one in told], np.float64),
+        np.full(len(told), np.nan),
+        np.array([np.nan if one.base is None else one.base for one in told], np.float64),
+        np.cumsum([0, *(len(one.surfaces) for one in told)]),
+        shapely.from_wkb([blob for blob, _ in surface]).astype(object),
+        Roofs(plane[:, :3], plane[:, 3:5], plane[:, 5:]),
+    )
+    return {f"{UPLOADED}{name}": values for name, values in RowPacker().pack(rows).items()}
+
+
+def read_uploads(task: Task) -> ModelRows:
+    """Read the uploaded buildings of a tile that tell their height, from the stage ``outlines``; mostly none."""
+    (found,) = task.read("outlines")
+    arrays = {
+        name.removeprefix(UPLOADED): values for name, values in found.arrays.items() if name.startswith(UPLOADED)
+    }
+    if not arrays:
+        return no_rows()
+    return unpack_rows(
+        lambda names, ranges: {name: np.concatenate([arrays[name][slice(*r)] for r in ranges]) for name in names},
+        [(0, len(arrays["model_end"]))],
+    )
+
+
+def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) -> int:
+    """Row of the building that is a house: of several of one id the one over it, then by level; -1 for none."""
     merit = [
         (
             round(shapely.area(shapely.intersection(rows.outlines[k], polygon)), 3),
@@ -195,7 +239,7 @@ def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) ->
         for i, k in enumerate(candidates)
     ]
     best = max(range(len(merit)), key=merit.__getitem__, default=-1)
-    return candidates[best] if best >= 0 and merit[best][0] > 0 else None  # a footprint beside it may have its id
+    return candidates[best] if best >= 0 and merit[best][0] > 0 else -1  # a footprint beside it may have its id
 
 
 def note_feet(footprints: Footprints, base: NDArray[np.float64], ground: NDArray[np.float64]) -> list[Note]:

@@ -45,7 +45,13 @@ def points_near(
 
 
 def add_unmarked(
-    task: Task, footprints: Footprints, roofs: RoofPoints, cloud: PointCloud, terrain: Dtm
+    task: Task,
+    footprints: Footprints,
+    roofs: RoofPoints,
+    cloud: PointCloud,
+    terrain: Dtm,
+    *,
+    told: NDArray[np.bool_],
 ) -> tuple[RoofPoints, Rows]:
     """Give the houses that the cloud does not mark the points of their roofs from other classes, and note them.
 
@@ -61,6 +67,8 @@ def add_unmarked(
         Points that include those of ground and water inside them.
     terrain : Dtm
         Terrain without empty nodes.
+    told : bool, (h,)
+        Houses that get none: uploads tell their roofs.
 
     Returns
     -------
@@ -75,7 +83,7 @@ def add_unmarked(
     heights above ground alone, and call roofs high vegetation. These are not taken unasked.
     """
     polygons, n_marked = footprints.polygons, np.diff(roofs.start)
-    bare = np.flatnonzero(find_bare(roofs, polygons))
+    bare = np.flatnonzero(find_bare(roofs, polygons) & ~told)
     rows, found = _find_roofs(task, polygons, bare, cloud, terrain, MAY_BE_ROOF)
     n_other = np.diff(found.start).tolist()
     details = [

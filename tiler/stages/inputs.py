@@ -48,7 +48,9 @@ from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
 from tiler.stages.blocks import BLOCK_ROWS, block_stages, replace_by_blocks
 from tiler.stages.city_files import (
     MODEL_PARAMETERS,
+    UPLOADED,
     list_kind,
+    pack_uploads,
     read_model_bands,
     read_model_file,
     read_terrain_file,
@@ -66,7 +68,7 @@ from tiler.stages.readers import (
     read_outlines,
     read_units,
 )
-from tiler.store.edit_journal import Edits
+from tiler.store.edit_journal import Edits, Outline
 
 MODEL_OUTLINES = "model-outlines"  # stage of the buildings of city models, where there are footprints, too
 EDITED = "edits"  # stage of what edits changed in a tile, for these tiles alone
@@ -291,20 +293,21 @@ def edited_tiles(tiles: Mapping[str, Box], edits: Edits) -> list[str]:
 def take_edits(task: Task) -> Facts:
     """Take what edits changed in a tile: ids that are gone, and footprints that came."""
     removed, outlines = task.parameters.edits["removed"], task.parameters.edits["outlines"]
-    mine = [outline for outline, box in outlines if boxes_touch(task.box, box)]
-    forms = [[np.nan if v is None else v for v in form] or [np.nan] * N_COLUMNS for _, _, _, form in mine]
+    mine = [Outline(*outline) for outline, box in outlines if boxes_touch(task.box, box)]
+    forms = [[np.nan if v is None else v for v in one.form] or [np.nan] * N_COLUMNS for one in mine]
     task.put(
         removed=np.array([name for name, box in removed if boxes_touch(task.box, box)], np.str_),
-        **pack_polygons(shapely.from_wkb([wkb for _, wkb, _, _ in mine]).astype(np.object_), "outline"),
-        ids=np.array([name for name, _, _, _ in mine], np.str_),
-        given_height=np.array([np.nan if height is None else height for _, _, height, _ in mine], np.float64),
+        **pack_polygons(shapely.from_wkb([one.polygon for one in mine]).astype(np.object_), "outline"),
+        ids=np.array([one.id for one in mine], np.str_),
+        given_height=np.array([np.nan if one.height is None else one.height for one in mine], np.float64),
         forms=np.array(forms, np.float64).reshape(-1, N_COLUMNS),
+        **pack_uploads(mine),
     )
     return {"n": len(mine)}
 
 
-def _edit(task: Task, footprints: Footprints) -> Footprints:
-    """Apply the edits of a tile to its footprints."""
+def _edit(task: Task, footprints: Footprints) -> tuple[Footprints, dict[str, NDArray[Any]]]:
+    """Apply the edits of a tile to its footprints; gives them, and the arrays of those that tell their height."""
     (found,) = (result.arrays for result in task.read(EDITED))
     kept = take_footprints(footprints, ~np.isin(footprints.ids, found["removed"]))
     came = unpack_polygons(found, "outline")
@@ -316,14 +319,16 @@ def _edit(task: Task, footprints: Footprints) -> Footprints:
         np.concatenate((kept.given_height, found["given_height"][near])),
         np.concatenate((kept.forms, found["forms"][near])),
     )
-    return take_footprints(both, np.argsort(ids, kind="stable"))
+    told = {name: values for name, values in found.items() if name.startswith(UPLOADED)}
+    return take_footprints(both, np.argsort(ids, kind="stable")), told
 
 
 def take_outlines(task: Task) -> Facts:
     """Take the footprints that meet a tile (step 1.2); beside a city model, its buildings and what these leave."""
     footprints = read_outlines(task, shift=task.parameters.footprints_shift)
+    told: dict[str, NDArray[Any]] = {}
     if task.refs.get(EDITED):
-        footprints = _edit(task, footprints)
+        footprints, told = _edit(task, footprints)
     if MODEL_OUTLINES in task.refs:
         footprints = _join_models(task, footprints)
     counts = {}
@@ -335,6 +340,7 @@ def take_outlines(task: Task) -> Facts:
         ids=footprints.ids,
         given_height=footprints.given_height,
         forms=footprints.forms,
+        **told,
     )
     extent = extent_of(footprints.polygons)
     # A house keeps within its footprint, and within the region.

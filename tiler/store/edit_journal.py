@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from pipeline.data.errors import InputError
 from tiler.objects.places import in_bucket
@@ -12,9 +13,26 @@ from tiler.store.checksums import is_sealed, seal
 
 JOURNAL = "edits"  # folder below a run's
 Box = tuple[float, float, float, float]
-# Id, well-known binary of the polygon in hexadecimal digits, height above ground (m) or None, form of the roof.
-Outline = tuple[str, str, float | None, tuple[float | None, ...]]
+# A roof surface: well-known binary of its polygon in hexadecimal digits; slopes, height, origin and limits (m) of
+# its plane, see `pipeline.data.roofs.Roofs`.
+Surface = tuple[str, tuple[float, ...]]
 Place = tuple[str, Box]
+
+
+class Outline(NamedTuple):
+    """A footprint that comes."""
+
+    id: str
+    polygon: str  # well-known binary in hexadecimal digits
+    height: float | None  # above ground (m), None where none is given
+    form: tuple[float | None, ...]  # of its roof, a row of `pipeline.data.roof_forms`
+    base: float | None = None  # lowest height of a model (m)
+    surfaces: tuple[Surface, ...] = ()  # its roof
+
+    @property
+    def tells(self) -> bool:
+        """Whether it states its height: roof points in the cloud are those of what stood there before."""
+        return self.height is not None
 
 
 @dataclass(frozen=True)
@@ -54,7 +72,7 @@ class Edit:
     @property
     def ids(self) -> list[str]:
         """Buildings that it touches, sorted."""
-        return sorted({*(name for name, _ in self.removed), *(name for name, *_ in self.outlines)})
+        return sorted({*(name for name, _ in self.removed), *(outline.id for outline in self.outlines)})
 
 
 @dataclass(frozen=True)
@@ -84,7 +102,7 @@ def add_up(journal: Sequence[Edit]) -> Edits:
     Examples
     --------
     >>> box = (0.0, 0.0, 1.0, 1.0)
-    >>> added = Edit(1, "2027-01-01", "add", "a.gpkg", (), (("a", "00", None, ()),), (box,))
+    >>> added = Edit(1, "2027-01-01", "add", "a.gpkg", (), (Outline("a", "00", None, ()),), (box,))
     >>> gone = Edit(2, "2027-01-02", "remove", "", (("a", box),), (), ())
     >>> len(add_up([added]).outlines), len(add_up([added, gone]).outlines)
     (1, 0)
@@ -95,7 +113,7 @@ def add_up(journal: Sequence[Edit]) -> Edits:
         removed |= set(edit.removed)
         for name, _ in edit.removed:
             there.pop(name, None)
-        there |= {row[0]: (row, box) for row, box in zip(edit.outlines, edit.boxes, strict=True)}
+        there |= {row.id: (row, box) for row, box in zip(edit.outlines, edit.boxes, strict=True)}
     return Edits(tuple(sorted(removed)), tuple(there[name] for name in sorted(there)))
 
 
@@ -132,7 +150,7 @@ def _read(path: Path) -> Edit:
         if not is_sealed(text) or found.pop("checksum") is None or path.stem != f"{found['number']:06d}":
             raise ValueError("its checksum differs")
         removed = tuple((str(name), _box(box)) for name, box in found.pop("removed"))
-        outlines = tuple((name, wkb, height, tuple(form)) for name, wkb, height, form in found.pop("outlines"))
+        outlines = tuple(map(_outline, found.pop("outlines")))
         boxes = tuple(map(_box, found.pop("boxes")))
         return Edit(**found, removed=removed, outlines=outlines, boxes=boxes)
     except (OSError, ValueError, TypeError, KeyError) as error:
@@ -142,3 +160,9 @@ def _read(path: Path) -> Edit:
 def _box(values: Sequence[float]) -> Box:
     xmin, ymin, xmax, ymax = map(float, values)
     return xmin, ymin, xmax, ymax
+
+
+def _outline(row: Sequence[Any]) -> Outline:
+    name, polygon, height, form, base, surfaces = row
+    surfaces = tuple((blob, tuple(plane)) for blob, plane in surfaces)
+    return Outline(name, polygon, height, tuple(form), base, surfaces)

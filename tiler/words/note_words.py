@@ -272,6 +272,9 @@ WORDS: dict[str, Words] = {
     "footprint-roof-like-plants": Words(
         OTHER, "{n} footprint[s] without roof points [has|have] unused vegetation points as smooth as a roof"
     ),
+    "upload-instead-of-points": Words(
+        OTHER, "{n} uploaded building[s] [tells its|tell their] own height[s], roof points there do not count"
+    ),
     "domain-lower-than-guidelines": Words(OTHER, "the domain is lower than six times the tallest building"),
     "footprints-outside": Words(OTHER, "footprints lie beyond the region"),
     "footprints-reader-warning": Words(OTHER, "the reader of the footprints gave {n} warning[s]"),

@@ -37,7 +37,7 @@ from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.planning.region import Pad
 from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.checksums import seal, state_files
-from tiler.store.edit_journal import Edits, add_up, read_journal
+from tiler.store.edit_journal import JOURNAL, Edits, add_up, read_journal
 from tiler.store.folder_lock import only_run
 from tiler.store.kept import IN_STORE, remove_dropped
 from tiler.store.out_folder import (
@@ -400,9 +400,10 @@ def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterato
 def _find_damage(out: Path) -> dict[str, str]:
     """Describe what is wrong with the files of a finished run that belong to no result.
 
-    Damaged results and their files are reported where they are made anew.
+    Damaged results and their files are reported where they are made anew. Edits that came since are input.
     """
-    return {found.path: found.what for found in Audit(out, deep=False).check_top()}
+    found = Audit(out, deep=False).check_top()
+    return {one.path: one.what for one in found if one.path != JOURNAL}
 
 
 def _foresee(plan: Plan, config: Config) -> list[str]:

@@ -20,15 +20,16 @@ import tiler
 from pipeline.data.citymodel import CityModel
 from pipeline.data.errors import InputError
 from pipeline.data.roofs import flat_roofs
+from tests.runs.test_city_models import parts_of
 from tests.runs.test_run import hashes
+from tests.tiler.cityinput.models import CORNERS, PLACE, city_json, solid, write_json
 from tiler.citymodels.cityjson import write_city_model
 from tiler.cli.main import main
 from tiler.config.config import make_config
-from tiler.editing.edit import list_edits
-from tiler.editing.requests import find_unused_heights
+from tiler.editing.edit import CITY_FILES, edit_city, list_edits
 from tiler.editing.staging import DONE_NOW, NOT_DONE
 from tiler.editing.uploads import Upload, read_upload
-from tiler.store.edit_journal import Edit, edit_path
+from tiler.store.edit_journal import edit_path
 from tiler.tiles3d.gltf import begin_glb
 from tiler.workflow.audit import Audit
 from tiler.workflow.run import run
@@ -83,7 +84,9 @@ def test_edits_end_in_the_bytes_of_one_run_and_a_day_has_those_before_it(edited:
     assert main(["edit", str(city), "--add", str(new), "--date", "2028-01-01", "--base", "2"]) == 0
     assert [edit.ids for edit in changed.edits()] == [[first], [gone], ["new"]]
     assert not [*Audit(city)]
-    ran = json.loads((city / "run.json").read_text())["ran"]
+    record = json.loads((city / "run.json").read_text())
+    assert "damaged-artefact" not in record["notes"]
+    ran = record["ran"]
     assert ran.keys().isdisjoint({"points", "footprints", "terrain"})
     assert ran["columns"] < 4  # others have the same buildings around them
 
@@ -165,7 +168,7 @@ def test_an_upload_in_another_crs_is_taken_to_that_of_the_region(edited: Path, t
     found = read_upload(
         Upload(path), make_config(record["parameters"]), crs=region["crs"], bounds=region["bounds"]
     )
-    assert shape.hausdorff_distance(found.polygons[0]) < 0.01
+    assert shape.hausdorff_distance(found.footprints.polygons[0]) < 0.01
 
 
 def test_a_building_of_cityjson_is_an_outline_with_a_height(edited: Path, tmp_path: Path) -> None:
@@ -178,7 +181,7 @@ def test_a_building_of_cityjson_is_an_outline_with_a_height(edited: Path, tmp_pa
     )
     path = tmp_path / "a.city.json"
     write_city_model(path, model, crs=CRS, bounds=(x, y, 0, x + 9, y + 9, 20))
-    found = read_upload(Upload(path), make_config(record["parameters"]), crs=crs, bounds=bounds)
+    found = read_upload(Upload(path), make_config(record["parameters"]), crs=crs, bounds=bounds).footprints
     assert (found.ids.tolist(), found.given_height.tolist()) == (["a"], [pytest.approx(9.5)])
     assert found.polygons[0].equals(square[0])
     far = tmp_path / "far.city.json"
@@ -195,10 +198,10 @@ def test_a_building_of_glb_stands_at_its_position_with_the_mean_height_of_its_ro
     x, y = bounds[0] + 40, bounds[1] + 30
     path = write_house(tmp_path / "house.glb", extras={"origin": [x, y, 2.0]})
     given: dict[str, Any] = {"config": make_config(record["parameters"]), "crs": crs, "bounds": bounds}
-    found = read_upload(Upload(path), **given)
+    found = read_upload(Upload(path), **given).footprints
     assert (found.ids.tolist(), found.given_height.tolist()) == (["house"], [pytest.approx(7.5, abs=0.01)])
     assert found.polygons[0].symmetric_difference(shapely.box(x + 1, y, x + 9, y + 6)).area < 0.01
-    moved = read_upload(Upload(path, (x + 50, y, 2.0)), **given).polygons[0]
+    moved = read_upload(Upload(path, (x + 50, y, 2.0)), **given).footprints.polygons[0]
     assert moved.equals(affinity.translate(found.polygons[0], 50.0))
     for data, words in (
         (write_house(tmp_path / "x.glb").read_bytes(), "give the position"),
@@ -241,11 +244,39 @@ def write_house(path: Path, extras: dict[str, Any] | None = None, **more: Any) -
     return path
 
 
-def test_a_height_that_roof_points_overrule_is_told(small_run: Path) -> None:
-    house, *_ = read_input(small_run)
-    rows = ((house, "", 12.0, ()), ("without points", "", 12.0, ()))
-    assert find_unused_heights(small_run, Edit(1, "2027-01-01", "add", "", (), rows, ())) == [house]
-    assert not find_unused_heights(small_run, Edit(1, "2027-01-01", "add", "", (), ((house, "", None, ()),), ()))
+def test_an_upload_keeps_its_roof_whatever_points_the_cloud_has_there(sloped_run: Path, tmp_path: Path) -> None:
+    city, shapes = shutil.copytree(sloped_run, tmp_path / "city"), read_input(sloped_run)
+    given = json.loads((city / "run.json").read_text())["parameters"]
+    house = max(shapes, key=lambda name: shapes[name].area)
+    x, y = map(round, shapes.pop(house).centroid.coords[0])
+    corners = [[x - 5 + a - PLACE[0], y - 4 + b - PLACE[1], 20 + c] for a, b, c in CORNERS]
+    objects = {house: {"type": "Building", "geometry": [solid()]}}
+    model = write_json(tmp_path / "new.city.json", city_json(objects, corners, crs=CRS))
+    said: list[str] = []
+    edit_city(city, "replace", house, Upload(model), say=said.append)
+    points, foot = said
+    assert foot.endswith("m above the ground")
+    assert re.fullmatch(rf"{house}: [1-9]\d* roof points in the cloud do not count", points)
+    parts = parts_of(city)
+    new = [parts[name] for name in parts if name.startswith(house)]
+    assert [(part["roof_method"], round(part["roof_slope"])) for part in new] == [("model", 37)] * 2
+    assert {part["roof_points"] for part in new} == {0}
+    assert not [*Audit(city)]
+
+    # One run on the final input: footprints without that house, and the model beside them.
+    final = write(tmp_path / "final.gpkg", *shapes.values(), ids=list(shapes))
+    values = {
+        "footprints": str(final),
+        "buildings": [str(model)],
+        "clearance": 1.0,
+        "out": str(tmp_path / "whole"),
+    }
+    run(make_config(given | values))
+    made, whole = (mesh_of(tmp_path / name) for name in ("city", "whole"))
+    assert len(made) > len(CITY_FILES)
+    assert {name for name in made if made[name] != whole[name]} <= {
+        *CITY_FILES
+    }  # which tell how points fit the roof
 
 
 def test_a_changed_or_lost_edit_is_found(edited: Path, tmp_path: Path) -> None:
