@@ -41,6 +41,7 @@ class CityOptions:
     border: Literal["drop", "clip"]
     simplify: Literal["clearance", "paper"]
     clearance: float
+    finer_clearance: float
     clearance_floor: float
     min_courtyard_area: float
     roofs: Literal["planes", "skeleton", "flat"]

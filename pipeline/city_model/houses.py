@@ -163,7 +163,8 @@ def _fit_sloped(
     Where planes are, points tell the roof if they are enough; else a given form does, and at last the outline.
     """
     model = city.model
-    new, told_of = ({}, []) if surfaces is None else lay_surfaces(city, surfaces, clearance=options.clearance)
+    distances = {"clearance": options.clearance, "finer": options.finer_clearance}
+    new, told_of = ({}, []) if surfaces is None else lay_surfaces(city, surfaces, **distances)
     laid = np.zeros(len(model), np.bool_)
     laid[list(new)] = True
     used = points if prefer_points else leave_out_points(points, laid)

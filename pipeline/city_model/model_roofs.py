@@ -14,7 +14,9 @@ TOLD_SHARE = 0.05  # of a house: larger overhangs and gaps are told ...
 TOLD_AREA = 1.0  # m2, ... if they are larger than this, too
 
 
-def lay_surfaces(city: City, surfaces: RoofSurfaces, *, clearance: float) -> tuple[dict[int, NewRoof], list[Note]]:
+def lay_surfaces(
+    city: City, surfaces: RoofSurfaces, *, clearance: float, finer: float
+) -> tuple[dict[int, NewRoof], list[Note]]:
     """Make the roofs that a city model has for houses.
 
     Parameters
@@ -23,8 +25,8 @@ def lay_surfaces(city: City, surfaces: RoofSurfaces, *, clearance: float) -> tup
         The houses.
     surfaces : RoofSurfaces
         Roof surfaces of each, none where nothing is known.
-    clearance : float
-        Least distance of walls (m).
+    clearance, finer : float
+        Least distance of walls (m), as for `make_surfaced_roof`.
 
     Returns
     -------
@@ -45,6 +47,7 @@ def lay_surfaces(city: City, surfaces: RoofSurfaces, *, clearance: float) -> tup
             surfaces.polygons[own],
             take_roofs(surfaces.roofs, own),
             clearance=clearance,
+            finer=finer,
         )
         if found is None:
             continue

@@ -8,7 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.roofs import Roofs, join_roofs, plane_heights, roof_heights, take_roofs
-from pipeline.geometry.rings import make_canonical
+from pipeline.geometry.rings import compute_sharpest_corners, make_canonical
 
 GRID = 0.001  # m, on which lines are noded
 SAME_PLANE = 0.05  # m; surfaces that are closer to one plane get one part
@@ -16,6 +16,8 @@ CROSSING = 0.05  # m; roofs that change order by less within a cell do not cross
 LEAST_SHARE = 0.125  # of a house; parts that are smaller, and than the least area, are joined with others
 LEAST_WIDTH = 0.5  # m, twice the area over the perimeter; narrower parts are joined with others ...
 SQUARES = 4.0  # ... and those smaller than this many squares of the least width
+JOINED_OFF = 0.5  # m; where roofs are farther off by joining parts (RMSE of the house), narrower ones are kept ...
+LEAST_ANGLE = 20.0  # degrees; ... if none of them has a sharper corner
 ROUNDS = 2  # of adding lines where surfaces cross
 LEAST_COVER = 0.01  # m2 of a house; a surface over less is that of another one
 LOST = 1e-3  # share of a house's area that its parts may miss
@@ -68,8 +70,47 @@ class SurfacedRoof:
     gap: float
 
 
+def square_gaps(polygons: NDArray[np.object_], roofs: Roofs, one: Index, other: Index) -> Array:
+    """Integrate the square of the distance of two roofs over polygons, without their limits.
+
+    Parameters
+    ----------
+    polygons : object, (n,)
+        Valid geometries (m); what has no area counts for nothing.
+    roofs : Roofs
+        Roofs.
+    one, other : int64, (n,)
+        Both roofs of each.
+
+    Returns
+    -------
+    float64, (n,)
+        Integrals (m4).
+
+    Examples
+    --------
+    >>> shed = Roofs(np.array([[1.0, 0, 0], [0, 0, 0]]), np.zeros((2, 2)), np.array([[0, 9.0], [0, 0]]))
+    >>> square_gaps(np.array([shapely.box(0, 0, 3, 2)]), shed, np.array([0]), np.array([1])).tolist()
+    [18.0]
+    """
+    parts, of = shapely.get_parts(shapely.normalize(polygons), return_index=True)
+    rings, ring_of = shapely.get_rings(parts, return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    part = ring_of[ring]
+    row = of[part]
+    gap = plane_heights(roofs, one[row], xy) - plane_heights(roofs, other[row], xy)
+    first = np.flatnonzero(np.diff(part, prepend=-1))[np.unique(part, return_inverse=True)[1].reshape(-1)]
+    # Triangles from the first vertex of a polygon to each of its edges, with the sign of their turn.
+    a = np.flatnonzero(ring[1:] == ring[:-1])
+    b, c = a + 1, first[a]
+    u, v = xy[a] - xy[c], xy[b] - xy[c]
+    f, g, h = gap[a], gap[b], gap[c]
+    total = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 12 * (f * f + g * g + h * h + f * g + g * h + h * f)
+    return np.abs(np.bincount(row[a], total, len(polygons)))
+
+
 def make_surfaced_roof(
-    polygon: shapely.Polygon, surfaces: NDArray[np.object_], roofs: Roofs, *, clearance: float
+    polygon: shapely.Polygon, surfaces: NDArray[np.object_], roofs: Roofs, *, clearance: float, finer: float = 0.0
 ) -> SurfacedRoof | None:
     """Make the roof of a house from the surfaces over it.
 
@@ -85,6 +126,8 @@ def make_surfaced_roof(
         Least distance of walls (m). A part that is narrower than it, or than `LEAST_WIDTH`, is joined with its
         neighbour of the closest plane; as is one smaller than `SQUARES` squares of that width and than an eighth
         of the house.
+    finer : float
+        Instead of the clearance where that puts the roof off by more than `JOINED_OFF` (m); 0 for none.
 
     Returns
     -------
@@ -124,8 +167,12 @@ def make_surfaced_roof(
     label = leader[chosen]
     parts, owner = _join_cells(cells.polygons[cells.inside], label)
     made = _widen(roofs, [leader == k for k in owner.tolist()], owner)
-    width = min(LEAST_WIDTH, clearance)
-    parts, rows = _join_small(parts, made, width, min(SQUARES * width**2, LEAST_SHARE * polygon.area))
+    cut, width = parts, min(LEAST_WIDTH, clearance)
+    parts, rows, whose = _join_small(cut, made, width, min(SQUARES * width**2, LEAST_SHARE * polygon.area))
+    if finer and square_gaps(cut, made, np.arange(len(cut)), whose).sum() > JOINED_OFF**2 * polygon.area:
+        narrow, others, _ = _join_small(cut, made, finer, min(SQUARES * finer**2, LEAST_SHARE * polygon.area))
+        if compute_sharpest_corners(narrow).min() >= LEAST_ANGLE:
+            parts, rows = narrow, others
     made = take_roofs(made, rows)
     if abs(float(shapely.area(parts).sum()) - polygon.area) > max(LOST * polygon.area, 0.05):
         return None
@@ -265,18 +312,19 @@ def _join_cells(cells: NDArray[np.object_], label: Index) -> tuple[NDArray[np.ob
 
 def _join_small(
     parts: NDArray[np.object_], roofs: Roofs, least_width: float, least: float
-) -> tuple[NDArray[np.object_], Index]:
+) -> tuple[NDArray[np.object_], Index, Index]:
     """Join parts that are too narrow (m) or small (m²), the smallest first, with that of the closest plane beside.
 
-    Gives the parts that are left, and the row of the roof of each.
+    Gives the parts that are left, the row of the roof of each, and that of the roof over each of all parts.
     """
     parts, row = parts.copy(), np.arange(len(parts))
+    whose = row.copy()
     there, kept = np.ones(len(parts), np.bool_), np.zeros(len(parts), np.bool_)
     area, width = shapely.area(parts), 2 * shapely.area(parts) / shapely.length(parts)
     while True:
         small = np.flatnonzero(there & ~kept & ((area < least) | (width < least_width)))
         if not len(small):
-            return parts[there], row[there]
+            return parts[there], row[there], whose
         k = int(small[np.argmin(area[small])])
         near = np.flatnonzero(there & shapely.intersects(parts, parts[k]))
         near = near[near != k]
@@ -295,5 +343,6 @@ def _join_small(
             continue
         j = min((np.round(f, 6), i) for i, f in enumerate(far) if whole[i])[1]
         parts[near[j]], there[k] = joined[j], False
+        whose[whose == k] = near[j]
         area[near[j]] = parts[near[j]].area
         width[near[j]] = 2 * area[near[j]] / parts[near[j]].length

@@ -6,7 +6,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.roofs import Roofs
+from pipeline.roofs.roof_surfaces import square_gaps
 from pipeline.simplification.graph import MILLIMETRES, WallGraph, find_close, find_crossings, find_near, make_graph
+from pipeline.simplification.labels import Territories
+from pipeline.simplification.shaping import Shaped
 
 # Clearances above this (m) are not measured: walls are as good as apart.
 FARTHEST = 5.0
@@ -84,12 +88,58 @@ def measure_simplification(
     )
 
 
-def _collect_walls(polygons: NDArray[np.object_]) -> tuple[WallGraph, NDArray[np.bool_]]:
+def find_sharpest(polygons: NDArray[np.object_]) -> float:
+    """Find the least angle (degrees) between two walls of polygons, of millimetres, that share walls."""
+    return _find_sharpest(_collect_walls(polygons, 1.0)[0])
+
+
+def measure_moved_roofs(
+    territories: Territories, shaped: Shaped, roofs: Roofs, building: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Measure how far roofs are off where walls moved: a face is under the roof of its own house everywhere.
+
+    Parameters
+    ----------
+    territories, shaped
+        Ground of the parts of houses before and after their walls were moved.
+    roofs : Roofs
+        Roof of each part, NaN where it is not known.
+    building : int64, (n,)
+        The building of each part.
+
+    Returns
+    -------
+    float64, (b,)
+        RMSE of the roofs of each building (m), over its faces; NaN for those without a known roof or a face.
+    """
+    known = ~np.isnan(roofs.plane[:, 2])
+    n = int(building.max(initial=-1)) + 1
+    ours = np.flatnonzero(known[shaped.house])
+    faces, house = shaped.polygons[ours], shaped.house[ours]
+    at, by = shapely.STRtree(territories.polygons).query(faces, predicate="intersects")
+    other = known[territories.house[by]] & (shaped.cluster[ours][at] == territories.cluster[by])
+    other &= house[at] != territories.house[by]
+    same = shapely.equals_identical(faces[at], territories.polygons[by])
+    other &= ~np.isin(at, at[same])
+    order = np.lexsort((by[other], at[other]))
+    at, by = at[other][order], by[other][order]
+    moved = shapely.intersection(faces[at], territories.polygons[by]) if len(at) else np.empty(0, object)
+    moved = shapely.transform(moved, lambda xy: xy / MILLIMETRES)
+    squares = np.bincount(building[house[at]], square_gaps(moved, roofs, house[at], territories.house[by]), n)
+    area = np.bincount(building[house], shapely.area(faces), n) / MILLIMETRES**2
+    with np.errstate(invalid="ignore"):
+        rmse: NDArray[np.float64] = np.sqrt(squares / area)
+    return rmse
+
+
+def _collect_walls(
+    polygons: NDArray[np.object_], unit: float = MILLIMETRES
+) -> tuple[WallGraph, NDArray[np.bool_]]:
     """Collect the walls of all polygons, each once; tell which belong to one polygon only."""
     xy, ring = shapely.get_coordinates(shapely.get_rings(polygons), return_index=True)
     start = np.flatnonzero(ring[1:] == ring[:-1])
     rows = np.column_stack((start, start + 1))
-    grid = np.rint(xy * MILLIMETRES)
+    grid = np.rint(xy * unit)
     walls = make_graph(grid, np.zeros(len(xy), np.int64), rows, np.zeros(len(rows)))
     number = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
     code = np.sort(number[rows], axis=1) @ np.array([len(walls.xy), 1])

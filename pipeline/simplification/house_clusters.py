@@ -42,6 +42,8 @@ class Shapes:
         Cluster of each building.
     closed : int64, (c, 2)
         Row and cluster of each part that was simplified by its closed outline.
+    clearance : float64, (k,)
+        Least distance of walls in the cluster of each building (m).
     counts : dict
         What was done, by name.
     """
@@ -51,6 +53,7 @@ class Shapes:
     member: NDArray[np.int64]
     cluster: NDArray[np.int64]
     closed: NDArray[np.int64]
+    clearance: NDArray[np.float64]
     counts: dict[str, int]
 
     def __len__(self) -> int:
@@ -77,7 +80,7 @@ def shape_clusters(
     rows = np.flatnonzero(of_part >= 0)
     if options.simplify == "paper":
         return _merge_clusters(parts.polygons, rows, of_part, options)
-    return _shape_planar_clusters(parts.polygons, rows, of_part, options, roofs)
+    return _shape_planar_clusters(parts, rows, of_part, options, roofs)
 
 
 def simplify_houses(
@@ -152,6 +155,7 @@ def join_shapes(several: Sequence[Shapes]) -> Shapes:
         np.concatenate([nothing, *(shapes.member for shapes in several)]),
         np.concatenate([nothing, *(shapes.cluster for shapes in several)]),
         np.concatenate([np.empty((0, 2), np.int64), *(shapes.closed for shapes in several)]),
+        np.concatenate([np.empty(0), *(shapes.clearance for shapes in several)]),
         dict(counts),
     )
 
@@ -171,6 +175,7 @@ def keep_shapes(shapes: Shapes, stays: NDArray[np.bool_]) -> Shapes:
         member_start=np.concatenate(([0], np.cumsum(size[stays]))).astype(np.int64),
         member=shapes.member[np.repeat(stays, size)],
         cluster=shapes.cluster[stays],
+        clearance=shapes.clearance[stays],
     )
 
 
@@ -223,6 +228,7 @@ def _merge_clusters(
                 np.concatenate(members),
                 np.full(len(members), cluster[of_cluster[0]]),
                 np.empty((0, 2), np.int64),
+                np.full(len(members), options.clearance),
                 {f"merge {how}": n for how, n in sorted(merged.counts.items())},
             )
         )
@@ -230,7 +236,7 @@ def _merge_clusters(
 
 
 def _shape_planar_clusters(
-    polygons: NDArray[np.object_],
+    parts: HouseParts,
     rows: NDArray[np.int64],
     cluster: NDArray[np.int64],
     options: CityOptions,
@@ -240,33 +246,36 @@ def _shape_planar_clusters(
 
     A comb of thin walls does that. Other clusters come out as before, to the bit.
     """
-    planar = _shape_planar(polygons, rows, cluster, options, roofs)
-    closable, outlines = _find_closable(polygons, rows, cluster, planar, options.clearance)
+    planar = _shape_planar(parts, rows, cluster, options, roofs)
+    closable, outlines = _find_closable(parts.polygons, rows, cluster, planar, options.clearance)
     if not len(closable):
         return planar
-    shapes = polygons.copy()
+    shapes = parts.polygons.copy()
     shapes[closable] = outlines
     again = np.unique(cluster[closable])
-    redone = _shape_planar(shapes, rows[np.isin(cluster[rows], again)], cluster, options, roofs)
+    closed_parts = replace(parts, polygons=shapes)
+    redone = _shape_planar(closed_parts, rows[np.isin(cluster[rows], again)], cluster, options, roofs)
     closed = np.column_stack((closable, cluster[closable]))
     return join_shapes([leave_out(planar, again), replace(redone, closed=closed)])
 
 
 def _shape_planar(
-    polygons: NDArray[np.object_],
+    parts: HouseParts,
     rows: NDArray[np.int64],
     cluster: NDArray[np.int64],
     options: CityOptions,
     roofs: Roofs | None,
 ) -> Shapes:
     planar: PlanarCity = shape_planar(
-        polygons[rows],
+        parts.polygons[rows],
         np.unique(cluster[rows], return_inverse=True)[1].reshape(-1),
         clearance=options.clearance,
         min_area=options.min_building_area,
         min_courtyard_area=options.min_courtyard_area,
         manifold=options.manifold,
         roofs=None if roofs is None else take_roofs(roofs, rows),
+        building=np.unique(parts.house[rows], return_inverse=True)[1].reshape(-1),
+        finer=options.finer_clearance,
     )
     member = rows[planar.house]
     return Shapes(
@@ -275,6 +284,7 @@ def _shape_planar(
         member,
         cluster[member],
         np.empty((0, 2), np.int64),
+        planar.clearance,
         {f"planar {how}": n for how, n in planar.counts.items()},
     )
 

@@ -19,7 +19,7 @@ NEAR_WALL = 0.7  # of the clearance: a node keeps that from walls that do not en
 
 
 def add_crossings(
-    polygons: NDArray[np.object_], roofs: Roofs, *, clearance: float
+    polygons: NDArray[np.object_], roofs: Roofs, *, clearance: NDArray[np.float64]
 ) -> tuple[NDArray[np.object_], int, int]:
     """Set a node on each wall between two roofs where these change order.
 
@@ -29,8 +29,8 @@ def add_crossings(
         Faces of one planar graph: where two of them share a wall, both have its vertices, to the bit.
     roofs : Roofs
         The roof of each.
-    clearance : float
-        A node is that far from the ends of its wall (m), and 0.7 of it from other walls.
+    clearance : float64, (n,)
+        A node is that far from the ends of its wall (m), and 0.7 of it from other walls: the least of both faces.
 
     Returns
     -------
@@ -51,9 +51,10 @@ def add_crossings(
     xy = ends[wall, 0] + place[:, None] * (ends[wall, 1] - ends[wall, 0])
     xy = np.rint(xy / GRID) * GRID
     length = np.hypot(*(ends[wall, 1] - ends[wall, 0]).T)
-    room = (place * length >= clearance) & ((1 - place) * length >= clearance)
-    room &= ~_is_near_others(polygons, xy, ends[wall], NEAR_WALL * clearance)
-    follows = np.append(False, (wall[1:] == wall[:-1]) & (np.diff(place * length) < clearance))
+    apart = clearance[sides[wall]].min(axis=1)
+    room = (place * length >= apart) & ((1 - place) * length >= apart)
+    room &= ~_is_near_others(polygons, xy, ends[wall], NEAR_WALL * apart)
+    follows = np.append(False, (wall[1:] == wall[:-1]) & (np.diff(place * length) < apart[1:]))
     room &= ~follows
     added = _insert(polygons, sides[wall[room]], ends[wall[room]], xy[room])
     return added, int(room.sum()), len(np.unique(wall[~room]))
@@ -100,7 +101,10 @@ def _find_crossings(
 
 
 def _is_near_others(
-    polygons: NDArray[np.object_], xy: NDArray[np.float64], ends: NDArray[np.float64], distance: float
+    polygons: NDArray[np.object_],
+    xy: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    distance: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Whether places are close to a wall other than their own."""
     edges = list_edges(polygons)

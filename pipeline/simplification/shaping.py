@@ -98,7 +98,7 @@ def join_shaped(pieces: list[Shaped]) -> Shaped:
 
 def shape_clusters(
     houses: NDArray[np.object_], cluster: NDArray[np.int64], rules: Rules, roofs: Roofs | None = None
-) -> tuple[Shaped, Counter[str]]:
+) -> tuple[Shaped, Territories, Counter[str]]:
     """Shape the houses of some clusters, each by the first rung that keeps the rules.
 
     Parameters
@@ -116,6 +116,8 @@ def shape_clusters(
     -------
     shaped : Shaped
         All clusters named in ``cluster``.
+    territories : Territories
+        The ground of each house before walls are moved.
     counts : Counter
         What `settle` and `mend_corners` did, and ``"small-faces"`` given away.
 
@@ -143,7 +145,7 @@ def shape_clusters(
         left = failed
     size = float(np.ceil(rules.clearance))
     pieces.extend(_collect(Outcome(*draw_cells(territories, int(name), size))) for name in left)
-    return join_shaped([*pieces, _name(left, LAST_RUNG)]), counts
+    return join_shaped([*pieces, _name(left, LAST_RUNG)]), territories, counts
 
 
 @dataclass(frozen=True, eq=False)

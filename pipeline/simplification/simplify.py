@@ -223,6 +223,7 @@ def _raise_planar(
         *_note_raised(footprints, heights, made.least, made.raised),
         *_note_outlines(houses, shapes.polygons, row, outline.house_error),
         *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
+        *_note_finer(houses, shapes, options.clearance),
     )
     divided = int((np.bincount(houses.parts.house, minlength=1) > 1).sum())
     counts = {**shapes.counts, "houses split": divided, **made.counts}
@@ -271,7 +272,7 @@ def _fit_sloped(
     least = wall_ground + options.roof_clearance
     low = is_flat(roofs) & (roofs.plane[:, 2] < least)
     roofs = choose_roofs(low, flat_roofs(least), roofs)
-    polygons, n_nodes, n_short = add_crossings(shapes.polygons, roofs, clearance=options.clearance)
+    polygons, n_nodes, n_short = add_crossings(shapes.polygons, roofs, clearance=shapes.clearance)
     counts = {
         "sloped parts": int((~is_flat(roofs)).sum()),
         "nodes where roofs cross": n_nodes,
@@ -364,6 +365,16 @@ def _note_closed(houses: Houses, rows: NDArray[np.int64]) -> list[Note]:
     return [
         Note("building-outline-closed", *place, "its walls are closer than the clearance") for _, place in places
     ]
+
+
+def _note_finer(houses: Houses, shapes: Shapes, clearance: float) -> list[Note]:
+    """Tell of the houses whose walls keep less than the clearance."""
+    least = np.full(len(houses), clearance)
+    np.minimum.at(
+        least, houses.parts.house[shapes.member], np.repeat(shapes.clearance, np.diff(shapes.member_start))
+    )
+    places = find_places(Footprints(houses.polygons, houses.ids, houses.given_height), least < clearance)
+    return [Note("building-finer-walls", *place, f"{least[k]:g} m, not {clearance:g} m") for k, place in places]
 
 
 def _note_raised(

@@ -28,6 +28,7 @@ CITY_OPTIONS = CityOptions(
     border="drop",
     simplify="paper",
     clearance=1.0,
+    finer_clearance=0.0,
     clearance_floor=0.1,
     min_courtyard_area=10.0,
     roofs="flat",

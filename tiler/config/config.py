@@ -34,6 +34,7 @@ PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is g
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
 LEAST_SIZE = 0.1  # m; of edges
 CLEARANCE_OF_MODELS = 0.5  # m; their walls are exact: moved by more, a court comes under a roof beside it
+FINER_CLEARANCE = 0.3  # m; at 0.2 m cells are flatter
 KEPT = ("both", "store", "pieces")  # what may stay in the folder of a run that is done
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
@@ -224,6 +225,11 @@ class Config:
         1.0, "simplify", "least distance of walls; with simplify = paper, buildings closer than this are merged. "
         f"Where roofs of a city model are meshed as they are, {CLEARANCE_OF_MODELS:g} m by default",
         unit="m", source="paper, step 2.1", least=0.1,
+    )  # fmt: skip
+    finer_clearance: float = _parameter(
+        0.0, "simplify", "least distance of walls in clusters of houses where roofs of a city model would be off "
+        f"by more than 0.5 m; 0: the clearance. Where that is not given, {FINER_CLEARANCE:g} m by default",
+        unit="m", least=0,
     )  # fmt: skip
     clearance_floor: float = _parameter(
         0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
@@ -582,6 +588,7 @@ def idle_parameters(config: Config) -> list[str]:
     idle += [
         (("roof_price",), config.roofs == "planes" and config.has_sloped_roofs, "roofs = planes"),
         (OF_FLAT_ROOFS, not config.has_sloped_roofs, "roofs = flat"),
+        (("finer_clearance",), config.keeps_model_roofs, "buildings whose roofs are meshed as they are"),
         (("grading",), config.graded_size, "open_size above 0"),
         (("wall_growth",), config.wall_size, "wall_size above 0"),
         (("refine_growth",), others, "refine, refine_areas, focus, lod_zones"),
@@ -621,7 +628,8 @@ def make_config(values: Mapping[str, Any]) -> Config:
             checked[entry.name] = value
     config = Config(**checked)
     if "clearance" not in checked and config.keeps_model_roofs:
-        config = dataclasses.replace(config, clearance=CLEARANCE_OF_MODELS)
+        finer = config.finer_clearance if "finer_clearance" in checked else FINER_CLEARANCE
+        config = dataclasses.replace(config, clearance=CLEARANCE_OF_MODELS, finer_clearance=finer)
     _check_together(config)
     return config
 
@@ -735,6 +743,10 @@ def _check_together(config: Config) -> None:
             "noise (7, 18) or buildings (building_classes); leave it out"
         )
     _check_sources(config)
+    if config.finer_clearance > config.clearance:
+        raise ConfigError(
+            f"finer_clearance = {config.finer_clearance:g} m: must be at most clearance = {config.clearance:g} m"
+        )
     if config.clearance_floor > config.clearance:
         raise ConfigError(
             f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"

@@ -37,6 +37,8 @@ CITY_PARAMETERS = (
         "manifold",
     ),
 )
+# Further one of the city model where roofs of a model are meshed as they are.
+FINER_PARAMETERS = ("finer_clearance",)
 # Parameters of seams and plane meshes.
 PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
 # Further ones of both where sizes are graded.
@@ -122,6 +124,7 @@ def city_options(given: Any) -> CityOptions:
         border="clip" if given.border == "clip" else "drop",
         simplify="paper" if given.simplify == "paper" else "clearance",
         clearance=given.clearance,
+        finer_clearance=_optional(given, "finer_clearance", 0.0),
         clearance_floor=given.clearance_floor,
         min_courtyard_area=given.min_courtyard_area,
         roofs=_roofs(given.roofs_or_flat),

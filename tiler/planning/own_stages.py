@@ -36,7 +36,13 @@ class OwnStages:
 
 def list_stages(config: Config) -> list[Stage]:
     """List the stages of a run in their order, as if it had no lakes, and simplified clusters of houses once."""
-    stages = [*input_stages(config), fill_stage(), house_stage(config), *first_round(config), shape_stage(0)]
+    stages = [
+        *input_stages(config),
+        fill_stage(),
+        house_stage(config),
+        *first_round(config),
+        shape_stage(config, 0),
+    ]
     stages += [*later_round(config, 1), model_stage(config, 0), *domain_stages(config)]
     stages += [*approach_stages(config), *layer_stages(config, Domain(config.expected_height, None))]
     stages += [*city_model_stages(config), fit_stage(config)]

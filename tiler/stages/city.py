@@ -68,6 +68,7 @@ from tiler.config.config import Config
 from tiler.config.step_options import (
     BLOCK_PARAMETERS,
     CITY_PARAMETERS,
+    FINER_PARAMETERS,
     ZONE_PARAMETERS,
     city_options,
     layer_parameters,
@@ -105,8 +106,9 @@ def house_stage(config: Config) -> Stage:
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
     models = ("buildings_given", "ground_of_models", "prefer") if config.buildings else ()
+    finer = FINER_PARAMETERS if config.keeps_model_roofs else ()
     blocks = BLOCK_PARAMETERS if config.has_blocks else ()
-    parameters = (*CITY_PARAMETERS, *TERRAIN, *models, *blocks)
+    parameters = (*CITY_PARAMETERS, *TERRAIN, *models, *finer, *blocks)
     return Stage("houses", Scope.TILE, make_houses, reads, parameters, version=6)
 
 
@@ -131,11 +133,12 @@ def member_stage(number: int) -> Stage:
     return Stage(f"members-{number}", Scope.TILE, list_members, (Read(f"join-{number}"),), version=2)
 
 
-def shape_stage(number: int) -> Stage:
+def shape_stage(config: Config, number: int) -> Stage:
     """Stage that simplifies the clusters of a round, each in the tile that owns it."""
     reads = [Read(f"members-{number}", own=True), Read("houses", named_by=f"members-{number}")]
     reads += [Read(f"shapes-{number - 1}", own=True)] if number else []
-    return Stage(f"shapes-{number}", Scope.TILE, shape_members, tuple(reads), CITY_PARAMETERS)
+    finer = FINER_PARAMETERS if config.keeps_model_roofs else ()
+    return Stage(f"shapes-{number}", Scope.TILE, shape_members, tuple(reads), (*CITY_PARAMETERS, *finer))
 
 
 def later_round(config: Config, number: int) -> list[Stage]:
@@ -178,7 +181,9 @@ def model_stage(config: Config, last: int) -> Stage:
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
     version = 9 if layered else 7
     zones = (*(ZONE_PARAMETERS if config.zoned else ()), *(BLOCK_PARAMETERS if config.has_blocks else ()))
-    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh, *zones), version=version)
+    finer = FINER_PARAMETERS if config.keeps_model_roofs else ()
+    parameters = (*CITY_PARAMETERS, *TERRAIN, *mesh, *finer, *zones)
+    return Stage("model", Scope.TILE, make, reads, parameters, version=version)
 
 
 def chooses_layers_later(config: Config) -> bool:
@@ -376,6 +381,8 @@ def shape_members(task: Task) -> Facts:
         closed=gathered.place[shapes.closed[:, 0]],
         closed_cluster=shapes.closed[:, 1],
     )
+    if task.parameters.get("finer_clearance", 0.0):
+        task.put(clearance=shapes.clearance)
     return {"n": len(shapes), "extent": extent_of(shapes.polygons), "counts": dict(sorted(counts.items()))}
 
 
@@ -592,6 +599,7 @@ def _earlier_shapes(task: Task, gathered: _Gathered) -> Shapes:
         np.arange(len(arrays["member"])),
         arrays["cluster"],
         np.column_stack((np.arange(len(arrays["closed"])), arrays["closed_cluster"])),
+        arrays.get("clearance", np.full(len(arrays["cluster"]), task.parameters.clearance)),
         {},
     )
     kept = leave_out(found, np.setdiff1d(arrays["cluster"], gathered.cluster[~gathered.changed]))

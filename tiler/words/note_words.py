@@ -99,6 +99,9 @@ WORDS: dict[str, Words] = {
     "building-outline-closed": Words(
         REPAIRED, "{n} building[s] [was|were] simplified by [its|their] closed outline[s]"
     ),
+    "building-finer-walls": Words(
+        OTHER, "walls of {n} building[s] keep less than --clearance, as roofs of the model would be off otherwise"
+    ),
     "building-roof-raised": Words(REPAIRED, "{n} roof[s] [was|were] raised over the terrain at the walls"),
     "courtyard-filled": Words(REPAIRED, "{n} courtyard[s] smaller than --min-courtyard-area [was|were] filled"),
     "land-cover-unknown-class": Words(

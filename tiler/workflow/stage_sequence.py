@@ -124,14 +124,14 @@ def run_city_stages(
     if deep := engine.records["coarse", REGION_ITEM].facts["deep"]:
         run_whole(engine, lake_stage(), fill_stage(), items={"lakes": deep, "terrain": deep})
     run_whole(engine, house_stage(config))
-    run_whole(engine, *first_round(config), shape_stage(0))
+    run_whole(engine, *first_round(config), shape_stage(config, 0))
     last = 0
     while True:
         run_whole(engine, *later_round(config, last + 1))
         if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
             break
         last += 1
-        run_whole(engine, member_stage(last), shape_stage(last))
+        run_whole(engine, member_stage(last), shape_stage(config, last))
     run_whole(engine, model_stage(config, last))
     return last + 1
 

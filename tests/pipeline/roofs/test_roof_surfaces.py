@@ -22,8 +22,12 @@ def roofs_of(planes: object, low: float = -np.inf, high: float = np.inf) -> Roof
     return Roofs(plane, np.zeros((len(plane), 2)), limits)
 
 
-def make(surfaces: object, planes: object, house: shapely.Polygon = HOUSE, clearance: float = 1.0) -> SurfacedRoof:
-    found = make_surfaced_roof(house, np.array(surfaces, object), roofs_of(planes), clearance=clearance)
+def make(
+    surfaces: object, planes: object, house: shapely.Polygon = HOUSE, clearance: float = 1.0, finer: float = 0.0
+) -> SurfacedRoof:
+    found = make_surfaced_roof(
+        house, np.array(surfaces, object), roofs_of(planes), clearance=clearance, finer=finer
+    )
     assert found is not None
     return found
 
@@ -90,6 +94,20 @@ def test_small_and_narrow_parts_take_the_closest_plane_beside_them() -> None:
     assert_covers(roof)
     kept = make(surfaces, [*SLOPES, [0, 0, 8.0], [0, 0, 5.9]], clearance=0.4)
     assert sorted(shapely.area(kept.parts).tolist()) == pytest.approx([0.9, 39.1, 40.0])
+
+
+def test_a_narrow_part_stays_at_the_finer_clearance_where_the_roof_would_be_off() -> None:
+    strip, wedge = shapely.box(0, 7.6, 10, 8), shapely.Polygon([(0, 7.2), (10, 8), (0, 8)])
+    for shape, height, finer, n in (
+        (strip, 30, 0.3, 3),
+        (strip, 30, 0.0, 2),
+        (strip, 6.5, 0.3, 2),
+        (wedge, 30, 0.3, 2),
+    ):
+        surfaces = [GABLE[0], shapely.difference(GABLE[1], shape), shape]
+        roof = make(surfaces, [*SLOPES, [0, 0, height]], finer=finer)
+        assert len(roof.parts) == n, (shape, height, finer)
+        assert_covers(roof)
 
 
 def test_a_courtyard_stays_open() -> None:

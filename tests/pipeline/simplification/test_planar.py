@@ -15,10 +15,11 @@ import pipeline.simplification.shaping
 import pipeline.simplification.snap
 from pipeline.data.errors import GeometryError
 from pipeline.data.roofs import Roofs, flat_roofs, join_roofs
-from pipeline.simplification.fidelity import FARTHEST, measure_simplification
+from pipeline.simplification.fidelity import FARTHEST, measure_moved_roofs, measure_simplification
 from pipeline.simplification.graph import WallGraph, find_near, make_graph, node_walls, trace_faces
 from pipeline.simplification.labels import Territories
 from pipeline.simplification.planar import COUNTS, PlanarCity, find_clusters, shape_planar, simplify_planar
+from pipeline.simplification.shaping import Shaped
 from pipeline.simplification.snap import node_crossings, straighten
 from pipeline.simplification.square_cells import draw_cells
 from tests.helpers.campaigns import examples
@@ -194,6 +195,36 @@ def test_common_ground_goes_to_the_higher_house_where_roofs_are_known(height: fl
         roofs=join_roofs([slope, flat_roofs(np.array([height]))]),
     )
     assert np.bincount(city.house, shapely.area(city.polygons)).tolist() == areas
+
+
+def test_a_cluster_whose_roofs_would_be_off_keeps_a_finer_clearance() -> None:
+    """A party wall with a step of 0.4 m, between 5 and 45 m; and the same one between 5 and 5.2 m elsewhere."""
+    low = Polygon([(0, 0), (10, 0), (10, 5), (10.4, 5), (10.4, 10), (0, 10)])
+    pair = np.array([low, box(0, 0, 20, 10) - low], dtype=object)
+    houses = np.concatenate((pair, shapely.transform(pair, lambda xy: xy + 100.0)))
+    roofs, cluster = flat_roofs(np.array([5.0, 45.0, 5.0, 5.2])), np.array([0, 0, 1, 1])
+
+    def shape(finer: float) -> PlanarCity:
+        return shape_planar(
+            houses,
+            cluster,
+            clearance=EPS,
+            min_area=MIN_AREA,
+            min_courtyard_area=MIN_COURTYARD,
+            roofs=roofs,
+            finer=finer,
+        )
+
+    coarse, fine = shape(0.0), shape(0.3)
+    assert set(coarse.clearance.tolist()) == {EPS}
+    assert fine.clearance[np.argsort(fine.house)].tolist() == [0.3, 0.3, EPS, EPS]
+    territories = Territories(shapely.transform(houses, lambda xy: xy * 1000), np.arange(4), cluster)
+    for city, off in ((coarse, 40 * 0.1), (fine, 0.0)):  # a triangle of 1 m2, or none, of 100 m2
+        faces = shapely.transform(city.polygons, lambda xy: xy * 1000)
+        shaped = Shaped(faces, city.house, cluster[city.house], np.empty(0, np.int64), {})
+        rmse = measure_moved_roofs(territories, shaped, roofs, np.arange(4))
+        assert rmse[:2].max() == pytest.approx(off, rel=0.05)
+        assert rmse[2:].max() == pytest.approx(0.02, rel=0.05)
 
 
 def test_houses_that_touch_in_a_corner_are_counted_or_parted() -> None:

@@ -209,7 +209,7 @@ def test_roofs_are_settled_cluster_by_cluster() -> None:
     x = np.array([0.0, 40.0, 50.0, 20.0, 70.0, 80.0])
     polygons = shapely.box(x, 0, x + 10, 10)
     nothing = np.empty((0, 2), np.int64)
-    shapes = Shapes(polygons, np.arange(7), np.arange(6), np.array([3, 5, 5, 0, 9, 9]), nothing, {})
+    shapes = Shapes(polygons, np.arange(7), np.arange(6), np.array([3, 5, 5, 0, 9, 9]), nothing, np.ones(6), {})
     heights = Heights(np.zeros(6), np.array([1.0, 9, 10, 30, 8, 20]), np.zeros(6, np.int8), np.zeros(6, np.bool_))
     roof, group = _settle_clusters(shapes, heights, np.ones(6), np.array(list("fedcba")), OPTIONS)
     assert roof.tolist() == [3.0, 9.5, 9.5, 30.0, 8.0, 20.0]
