@@ -632,6 +632,10 @@ def _add_export(export: argparse.ArgumentParser) -> None:
             "metavar": "X0,Y0,X1,Y1",
             "help": "add the cells along a vertical plane between two places of the CRS; repeatable",
         },
+        "generalised": {
+            "metavar": "FILE",
+            "help": "blocks of `citystitch generalise`, which stand for houses in the upper levels of 3D Tiles",
+        },
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }
     for option, words in given.items():

@@ -16,7 +16,7 @@ from tiler.convert.features import plain_value, rings_of, unique_name
 from tiler.convert.inputs import ModelSource
 from tiler.export.surface import open_surface
 from tiler.mesh_files.run_files import find_files
-from tiler.tiles3d.cell_buffers import CellBuffers
+from tiler.tiles3d.cells import CellBuffers
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from tiler.export.foam_patches import patch_of_key
 from tiler.export.surface import RunSurface, open_surface
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, crs_of
 from tiler.store.run_folder import read_run_record
-from tiler.tiles3d.buildings import Part, Unit, draw_units, generalise, make_units
+from tiler.tiles3d.blocks import Pieces, join_pieces, load_pieces
+from tiler.tiles3d.buildings import STEP, Part, Unit, draw_units, generalise, make_units
 from tiler.tiles3d.cells import Cell, CellGrid, make_grid
 from tiler.tiles3d.content import Layer, make_content
 from tiler.tiles3d.globe import Array, Globe
@@ -29,6 +30,7 @@ class Made:
 
     lattice: Lattice
     units: list[Unit]
+    pieces: Pieces = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +96,13 @@ class Base:
         leaves: list[int] = self.grid.leaves_of(lon, lat).tolist()
         return leaves
 
-    def smallest(self, cell: Cell, rows: Array, parts: Sequence[Part], sliced: Array) -> Content | None:
-        """Make one of the smallest cells of its ground, parts and triangles of slices; None if it has none."""
+    def smallest(
+        self, cell: Cell, rows: Array, parts: Sequence[Part], sliced: Array, blocks: bytes = b""
+    ) -> Content | None:
+        """Make one of the smallest cells of its ground, parts and triangles of slices; None if it has none.
+
+        `blocks` are those for the levels above, as `deal_blocks` wrote them.
+        """
         box = self.grid.box(cell)
         units = make_units(parts)
         layers = [layer] if (layer := draw_units(units)) else []
@@ -107,13 +114,15 @@ class Base:
         cut, quality = slice_surface(sliced)
         if len(quality):
             layers.append(Layer("cells", cut, {"quality": quality}))
-        return self._draw(layers, Made(lay_lattice(self.site, box, surface), units), 0.0)
+        made = Made(lay_lattice(self.site, box, surface), units, load_pieces(blocks))
+        return self._draw(layers, made, 0.0)
 
     def coarse(self, cell: Cell, children: Mapping[tuple[int, int], Made]) -> Content | None:
         """Make a cell from what its children handed up; None if that is nothing."""
         box, allowed = self.grid.box(cell), self._allowed(cell)
         below = [unit for place in sorted(children) for unit in children[place].units]
-        units, error = generalise(below, allowed)
+        pieces = join_pieces([children[place].pieces for place in sorted(children)], allowed / 2, STEP)
+        units, error = generalise(below, allowed, pieces)
         lattice = coarsen(self.site, box, {place: child.lattice for place, child in children.items()})
         layers = [layer] if (layer := draw_units(units)) else []
         surface = draw_lattice(self.site, box, lattice)
@@ -122,7 +131,7 @@ class Base:
             layers.append(Layer("terrain", ground, {"patch": [patch_of_key(Marker.GROUND, ()).name]}))
         if not layers and (layer := draw_units(below)):  # low buildings alone: they stay
             layers, units, error = [layer], below, max(unit.error for unit in below)
-        return self._draw(layers, Made(lattice, units), max(error, lattice.error))
+        return self._draw(layers, Made(lattice, units, pieces), max(error, lattice.error))
 
     def _allowed(self, cell: Cell) -> float:
         """Give the distance (m) that the level of a cell allows."""

@@ -3,13 +3,14 @@
 In the smallest cells each building, or part of one, has the most detailed solid of the city model. In those
 above, a distance from these is allowed. What is lower than half of that is left out; parts of a house whose
 roofs are within it of one height become a block, of an outline with fewer vertices; parts that are not stay. So
-a house is of LoD2.2, then 1.3, then 1.2. Units that stand for several houses have their place in `generalise`.
+a house is of LoD2.2, then 1.3, then 1.2. Where blocks are given (LoD0C, 0B, 0A), the highest that is within that
+distance of the houses in it takes their place, as far as it lies in the cell.
 """
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -31,7 +32,9 @@ from tiler.citymodels.building_index import (
     read_building,
     read_objects,
 )
+from tiler.stages.blocks import LAYERS
 from tiler.store.run_folder import WRONG_FIELD
+from tiler.tiles3d.blocks import Block, Pieces, take_areas
 from tiler.tiles3d.content import Ints, Layer, Surface, join_surfaces
 from tiler.tiles3d.globe import Array
 from tiler.tiles3d.metadata import NO_NUMBER, Column
@@ -65,6 +68,8 @@ class Part:
         Their corners.
     roof : list of bool
         Whether each triangle is of the roof.
+    blocks : list of str
+        Ids of the blocks that it is in, the lowest level first.
     """
 
     id: str
@@ -75,27 +80,31 @@ class Part:
     xyz: list[list[float]]
     triangles: list[list[int]]
     roof: list[bool]
+    blocks: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """A part as it is, or a block that stands for parts of a house.
+    """A part as it is, or a block that stands for parts of a house or for several houses.
 
     Attributes
     ----------
     house : str
-        Id of the house.
+        Id of the house; ``""`` of several.
     outline : shapely geometry
         Outline in the CRS (m).
     bottom, low, high : float
-        Lowest ground beside it, and lowest and highest place of the roofs that it stands for (m). A block ends in
-        the middle between these.
+        Lowest ground beside it, and lowest and highest place of the roofs that it stands for (m).
     attributes : dict
         Those of `TEXTS` and `NUMBERS` that it has.
     moved : float
         How far its outline is from that of the parts (m), at most.
     part : Part or None
         The part itself; None for a block.
+    blocks : list of str
+        Ids of the blocks that it is in, the lowest level first.
+    block : Block or None
+        What stands for several houses.
     """
 
     house: str
@@ -106,11 +115,18 @@ class Unit:
     attributes: dict[str, Any]
     moved: float = 0.0
     part: Part | None = None
+    blocks: Sequence[str] = ()
+    block: Block | None = None
+
+    @property
+    def top(self) -> float:
+        """Height of the roof of a block (m): without one of its own, the middle of the roofs."""
+        return (self.low + self.high) / 2 if self.block is None else self.block.top
 
     @property
     def rise(self) -> float:
         """Distance of its roofs from one height (m)."""
-        return (self.high - self.low) / 2
+        return max(self.top - self.low, self.high - self.top)
 
     @property
     def error(self) -> float:
@@ -237,13 +253,12 @@ def make_units(parts: Sequence[Part]) -> list[Unit]:
         top = part.attributes["roof_height"]
         low, high = (min(roofs), max(roofs)) if roofs else (top, top)
         bottom = min(z for _, _, z in part.xyz)
-        found.append(
-            Unit(part.house, shapely.from_wkb(part.footprint), bottom, low, high, part.attributes, part=part)
-        )
+        outline = shapely.from_wkb(part.footprint)
+        found.append(Unit(part.house, outline, bottom, low, high, part.attributes, part=part, blocks=part.blocks))
     return found
 
 
-def generalise(units: Sequence[Unit], allowed: float) -> tuple[list[Unit], float]:
+def generalise(units: Sequence[Unit], allowed: float, pieces: Pieces) -> tuple[list[Unit], float]:
     """Make what stands for the units of the level below.
 
     Parameters
@@ -252,22 +267,27 @@ def generalise(units: Sequence[Unit], allowed: float) -> tuple[list[Unit], float
         Those of the level below.
     allowed : float
         Distance from the buildings that the level allows (m).
+    pieces : mapping of str to (Block, shapely geometry)
+        Blocks in the cell, by id.
 
     Returns
     -------
     list of Unit
-        What is left.
+        What is left. Of a block that is wider than the distance, its height does not count: it is seen from above.
     float
         The largest distance of these from the buildings (m); of one that is left out its height.
     """
     error = 0.0
     own: dict[str, list[Unit]] = {}
-    for unit in units:
-        if unit.high - unit.bottom <= LOW * allowed:
+    kept: list[Unit] = []
+    for unit in _place_blocks(units, allowed, pieces):
+        is_wide = unit.block is not None and unit.block.side > allowed
+        if unit.high - unit.bottom <= LOW * allowed and not is_wide:
             error = max(error, unit.high - unit.bottom)
+        elif unit.block is not None:
+            kept.append(unit)
         else:
             own.setdefault(unit.house, []).append(unit)
-    kept: list[Unit] = []
     for house in sorted(own):
         group: list[Unit] = []
         for unit in sorted(own[house], key=lambda unit: (unit.low, unit.high)):
@@ -283,6 +303,53 @@ def generalise(units: Sequence[Unit], allowed: float) -> tuple[list[Unit], float
     return kept, max([error, *(unit.error for unit in kept)])
 
 
+def _place_blocks(units: Sequence[Unit], allowed: float, pieces: Pieces) -> Sequence[Unit]:
+    """Put blocks in the place of the houses that they stand for, where they are near enough: the highest first."""
+    for level in reversed(LAYERS):
+        groups = defaultdict[str, list[int]](list)
+        for k, unit in enumerate(units):
+            for below, name in zip(("", *unit.blocks), unit.blocks, strict=False):
+                # An object of LoD0A that is one of LoD0B alone stays that.
+                same = level == "0A" and below in pieces and pieces[below][0].members == pieces[name][0].members
+                if name in pieces and pieces[name][0].level == level and not same:
+                    groups[name].append(k)
+        found, gone = list[Unit](), set[int]()
+        for name in sorted(groups):
+            unit = _stand_for([units[k] for k in groups[name]], *pieces[name], allowed)
+            if unit.error <= allowed:
+                found.append(unit)
+                gone.update(groups[name])
+        units = [*(unit for k, unit in enumerate(units) if k not in gone), *found]
+    return units
+
+
+def _stand_for(units: list[Unit], block: Block, piece: Any, allowed: float) -> Unit:
+    """Make a block of the houses in a cell, of its outline there with fewer vertices.
+
+    Its distance from them in plan is at most its height, as there is ground where it is not.
+    """
+    whole = shapely.union_all([unit.outline for unit in units], grid_size=STEP)
+    outline = shapely.simplify(piece, min(allowed * PLAN_SHARE, piece.area**0.5 * SIDE_SHARE))
+    bottom = min(unit.bottom for unit in units)
+    moved = max(unit.moved for unit in units) + _distance(whole, outline)
+    attributes = {"ground_height": block.ground, "roof_height": block.top, "height": block.top - block.ground}
+    chain = units[0].blocks[list(units[0].blocks).index(block.id) :]
+    low, high = min(unit.low for unit in units), max(unit.high for unit in units)
+    near = min(moved, block.top - bottom)
+    return Unit("", outline, bottom, low, high, attributes, near, blocks=chain, block=block)
+
+
+def _distance(a: Any, b: Any) -> float:
+    """Give the distance of two areas in plan: at vertices, and in the middle of the largest gap of the first."""
+    corners = (shapely.points(shapely.get_coordinates(one)) for one in (a, b))
+    far = [shapely.distance(some, other).max(initial=0.0) for some, other in zip(corners, (b, a), strict=True)]
+    gap = take_areas(shapely.difference(b, a, grid_size=STEP))
+    if gap.area > 0:
+        middle = shapely.get_point(shapely.maximum_inscribed_circle(gap, 100 * STEP), 0)
+        far.append(shapely.distance(middle, a))
+    return float(max(far))
+
+
 def _merge(units: list[Unit], allowed: float) -> Unit:
     """Put units of a house that are nearly of one height under one roof, with an outline of fewer vertices."""
     whole = shapely.union_all([unit.outline for unit in units], grid_size=STEP)
@@ -293,7 +360,8 @@ def _merge(units: list[Unit], allowed: float) -> Unit:
     ground = min(unit.attributes["ground_height"] for unit in units)
     attributes = {key: largest.attributes[key] for key in TEXTS if key in largest.attributes}
     attributes |= {"ground_height": ground, "roof_height": high, "height": high - ground}
-    return Unit(largest.house, outline, min(unit.bottom for unit in units), low, high, attributes, moved)
+    bottom = min(unit.bottom for unit in units)
+    return Unit(largest.house, outline, bottom, low, high, attributes, moved, blocks=largest.blocks)
 
 
 def draw_units(units: Sequence[Unit]) -> Layer | None:
@@ -307,17 +375,24 @@ def draw_units(units: Sequence[Unit]) -> Layer | None:
         if surface is None:
             continue
         surfaces.append(replace(surface, feature=np.full(len(surface.xyz), len(rows))))
-        name, lod = (
-            (unit.house, BLOCKS[several[unit.house] > 1]) if unit.part is None else (unit.part.id, unit.part.lod)
+        name, lod, n = (
+            (unit.block.id, unit.block.level, unit.block.members)
+            if unit.block
+            else (unit.house, BLOCKS[several[unit.house] > 1], 1)
+            if unit.part is None
+            else (unit.part.id, unit.part.lod, 1)
         )
-        rows.append(unit.attributes | {"id": name, "house": unit.house, "lod": lod, "error": unit.error})
+        rows.append(
+            unit.attributes | {"id": name, "house": unit.house, "lod": lod, "error": unit.error, "buildings": n}
+        )
     if not rows:
         return None
     columns: dict[str, Column] = {
         key: [str(row.get(key, "")) for row in rows] for key in ("id", "house", "lod", *TEXTS)
     }
     columns |= {
-        key: np.array([row.get(key, NO_NUMBER) for row in rows], np.float32) for key in (*NUMBERS, "error")
+        key: np.array([row.get(key, NO_NUMBER) for row in rows], np.float32)
+        for key in (*NUMBERS, "error", *(["buildings"] if any(unit.block for unit in units) else []))
     }
     return Layer("buildings", join_surfaces(surfaces), columns)
 
@@ -341,7 +416,7 @@ def _extrude(units: Sequence[Unit]) -> Iterator[Surface | None]:
     first = np.flatnonzero(ring[1:] == ring[:-1])
     of_wall = of_part[of_ring[ring[first]]]
     bottom = np.array([unit.bottom for unit in units], np.float64)
-    top = np.array([(unit.low + unit.high) / 2 for unit in units], np.float64)
+    top = np.array([unit.top for unit in units], np.float64)
     a, b, low, high = xy[first], xy[first + 1], bottom[of_wall], top[of_wall]
     ways = (a, low), (b, low), (b, high), (a, high)
     walls = np.stack([np.column_stack(way) for way in ways], axis=1)

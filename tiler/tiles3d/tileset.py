@@ -3,6 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -16,9 +17,9 @@ from tiler.mesh_files.run_files import RunFiles
 from tiler.store.atomic import replacing, replacing_folder
 from tiler.store.out_folder import CITY_MODEL
 from tiler.tiles3d.base import Base, Made, SortedPiece, open_base
+from tiler.tiles3d.blocks import BlockNames, deal_blocks
 from tiler.tiles3d.buildings import Part, load_parts, read_parts, write_part
-from tiler.tiles3d.cell_buffers import CellBuffers
-from tiler.tiles3d.cells import Cell, encode
+from tiler.tiles3d.cells import Cell, CellBuffers, encode
 from tiler.tiles3d.slices import ROW as SLICE_ROW
 from tiler.tiles3d.slices import cut_pieces, make_slices
 from tiler.tiles3d.subtrees import TILESET, Tile, Tree, make_tileset, write_tree
@@ -36,6 +37,7 @@ def export_tileset(
     vertical_crs: str = "",
     slice_height: Sequence[float] = (),
     slice_line: Sequence[str] = (),
+    generalised: str = "",
     keep: UpdateState | None = None,
 ) -> list[str]:
     """Write a finished run as 3D Tiles 1.1.
@@ -50,6 +52,8 @@ def export_tileset(
         See `Globe`.
     slice_height, slice_line
         Where the volume mesh is cut: see `make_slices`.
+    generalised : str
+        GeoPackage of `citystitch generalise`, whose blocks stand for houses in the upper levels; none by default.
     keep : UpdateState, optional
         Takes what an update of the tileset needs, see `tiler.tiles3d.update`.
 
@@ -63,7 +67,7 @@ def export_tileset(
     ConfigError
         As of `Globe` and `make_slices`.
     InputError
-        If a file of the run is missing or damaged.
+        If a file of the run is missing or damaged, or that of blocks is, or has no house of the run.
     OutputError
         If the folder cannot be written.
 
@@ -77,12 +81,19 @@ def export_tileset(
     globe, grid = base.site.globe, base.grid
     told: Counter[str] = Counter()
     with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".cells.") as name:
-        ground, buildings, cut = (
-            CellBuffers(_make_folder(Path(name) / kind)) for kind in ("ground", "buildings", "slices")
+        ground, buildings, cut, blocks = (
+            CellBuffers(_make_folder(Path(name) / kind)) for kind in ("ground", "buildings", "slices", "blocks")
         )
         found = _sort_ground(base, ground)
         lowest = find_lowest(one.lowest for one in found.values())
-        places = _sort_parts(read_parts(files.directory / CITY_MODEL, lowest, told), base, buildings)
+        parts = read_parts(files.directory / CITY_MODEL, lowest, told)
+        if generalised:
+            with closing(BlockNames(Path(name) / "names")) as names:
+                deal_blocks(generalised, base.crs, base.site, grid, blocks, names)
+                parts = _name_blocks(parts, names, generalised, told)
+                places = _sort_parts(parts, base, buildings)
+        else:
+            places = _sort_parts(parts, base, buildings)
         for rows in cut_pieces(base.surface.pieces, slices):
             lon, lat, _ = globe.geographic(rows[:, :9].reshape(-1, 3, 3).mean(axis=1)).T
             cut.add_rows(grid.leaves_of(lon, lat), rows)
@@ -100,7 +111,8 @@ def export_tileset(
                 code = int(encode(np.array([x]), np.array([y]))[0])
                 rows = np.frombuffer(ground.read(code)).reshape(-1, ROW)
                 sliced = np.frombuffer(cut.read(code)).reshape(-1, SLICE_ROW)
-                content = base.smallest(cell, rows, load_parts(buildings.read(code)), sliced)
+                own_parts = load_parts(buildings.read(code))
+                content = base.smallest(cell, rows, own_parts, sliced, blocks.read(code))
             if content is None:
                 raise InputError(f"cell {cell}: has neither ground nor buildings; run again")
             write_content(folder, cell, content.data)
@@ -170,6 +182,18 @@ def find_lowest(tiles: Iterable[Mapping[int, float]]) -> dict[int, float]:
         for number, least in lowest.items():
             found[number] = min(least, found.get(number, np.inf))
     return found
+
+
+def _name_blocks(parts: Iterator[Part], names: BlockNames, file: str, told: Counter[str]) -> Iterator[Part]:
+    """Tell each part which blocks it is in."""
+    n = unknown = 0
+    for part in parts:
+        blocks = names.find(part.house)
+        n, unknown = n + 1, unknown + (not blocks)
+        yield replace(part, blocks=blocks)
+    if n and n == unknown:
+        raise InputError(f"{file}: has no building of the run; make it of this run, citystitch generalise RUN")
+    told[f"of {n} parts of buildings are in no object of {Path(file).name}, and stay houses"] = unknown
 
 
 def _sort_parts(parts: Iterator[Part], base: Base, buffers: CellBuffers) -> dict[str, int]:

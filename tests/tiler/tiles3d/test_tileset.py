@@ -6,14 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio
 import pyproj
 import pytest
+import shapely
 
-from pipeline.data.errors import ConfigError
+from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.mesh import Marker
 from tests.helpers.tilesets import contents, ellipsoid, read_content, split_subtree, to_degrees, walk_tree
+from tests.tiler.editing.test_edit import write
 from tiler.cli.main import main
+from tiler.export.export import export_run
 from tiler.export.surface import open_surface
+from tiler.generalisation.generalise import generalise
+from tiler.generalisation.options import Asked, Inputs
+from tiler.tiles3d import base, cells
 from tiler.tiles3d.cells import encode
 from tiler.tiles3d.content import Surface
 from tiler.tiles3d.globe import Globe
@@ -109,6 +116,47 @@ def test_features_of_the_finest_tiles_are_the_buildings(sloped_run: Path, tiles:
     assert {row["house"] for row in coarse} <= houses
     assert {row["lod"] for row in coarse} & {"1.2", "1.3"}
     assert len(coarse) < len(finest)
+
+
+def test_blocks_stand_for_houses_in_the_upper_levels(
+    sloped_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each house stays in sight up the tree: by itself, or by the one object that stands for it."""
+    monkeypatch.setattr(cells, "STEP", cells.STEP / 4)  # 76 m
+    monkeypatch.setattr(base, "SHARE", 16)  # 9.5, 19 and 38 m are allowed above
+    blocks = tmp_path / "blocks.gpkg"
+    generalise(Inputs(models=[sloped_run]), blocks, Asked(least_share=0.05))
+    export_run(sloped_run, tmp_path / "tiles", name="3dtiles", options={"generalised": str(blocks)})
+    known: dict[str, tuple[float, float]] = {}
+    for layer in ("lod0c", "lod0b", "lod0a"):
+        columns = ["id", "height", "members", "ground_height"]  # in the order of the file
+        _, _, _, values = pyogrio.raw.read(blocks, layer=layer, columns=columns)
+        known |= {name: (n, height + ground) for name, height, n, ground in zip(*values, strict=True)}
+    box = np.array(json.loads((tmp_path / "tiles/tileset.json").read_text())["root"]["boundingVolume"]["region"])
+    tree, lods, whole = walk_tree(tmp_path / "tiles"), dict[int, set[str]](), set[float]()
+    for (level, x, y), path in contents(tmp_path / "tiles"):
+        part = read_content(path)[1].get("buildings")
+        if part is None:
+            continue
+        lods.setdefault(level, set()).update(part.table["lod"])
+        assert max(part.table["error"]) <= tree[level, x, y].error + 1e-5  # of float32
+        for k, (name, lod) in enumerate(zip(part.table["id"], part.table["lod"], strict=True)):
+            if lod.startswith("0"):
+                places = to_degrees(part.places[part.feature == k])
+                found = part.table["buildings"][k], part.table["roof_height"][k], places[:, 2].max()
+                assert found == pytest.approx((known[name][0], known[name][1], known[name][1]), abs=0.01)
+                assert found[0] > 1
+                within = (np.radians(places[:, :2]) - box[:2]) / (box[2:4] - box[:2]) * 2**level - (x, y)
+                assert (abs(within - 0.5) < 0.5 + 1e-3).all()  # no farther than its cell
+        if level == 0:
+            whole.update(part.table["buildings"])
+    depth = max(lods)
+    assert (lods[depth], lods[0], sum(whole)) == ({"2.2"}, {"0A"}, 24)
+    assert {"1.2", "0C"} <= lods[depth - 1]
+    other = tmp_path / "other.gpkg"
+    generalise(Inputs(footprints=write(tmp_path / "one.gpkg", shapely.box(0, 0, 9, 9), ids=["x"])), other, Asked())
+    with pytest.raises(InputError, match=r"other\.gpkg: has no building of the run"):
+        export_run(sloped_run, tmp_path / "no", name="3dtiles", options={"generalised": str(other)})
 
 
 def test_the_same_run_gives_the_same_bytes(sloped_run: Path, tiles: Path, tmp_path: Path) -> None:
