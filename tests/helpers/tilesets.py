@@ -13,6 +13,7 @@ import pyproj
 from numpy.typing import NDArray
 
 Cell = tuple[int, int, int]
+PACKED = "KHR_draco_mesh_compression"
 TYPES = {"SCALAR": 1, "VEC3": 3}
 COMPONENTS = {5120: "i1", 5123: "<u2", 5125: "<u4", 5126: "<f4", "FLOAT32": "<f4", "FLOAT64": "<f8"}
 UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -116,21 +117,46 @@ def read_content(path: Path) -> tuple[dict[str, Any], dict[str, Part]]:
     matrix = next(np.array(node["matrix"]).reshape(4, 4).T for node in document["nodes"] if "matrix" in node)
     for mesh in document["meshes"]:
         primitives = mesh["primitives"]
-        names = primitives[0]["attributes"]
-        position = _accessor(document, body, names["POSITION"]).astype(np.float64)
-        places = (UP @ matrix @ np.column_stack((position, np.ones(len(position)))).T).T[:, :3]
-        triangles = {
-            document["materials"][one["material"]]["name"]: _accessor(document, body, one["indices"])
-            .reshape(-1, 3)
-            .astype(np.int64)
-            for one in primitives
-        }
+        names = [document["materials"][one["material"]]["name"] for one in primitives]
         (ids,) = primitives[0]["extensions"]["EXT_mesh_features"]["featureIds"]
-        feature = _accessor(document, body, names[f"_FEATURE_ID_{ids['attribute']}"]).ravel().astype(np.int64)
+        if PACKED in primitives[0]["extensions"]:
+            vertices, feature, triangles = _unpack(document, body, primitives, names)
+        else:
+            attributes = primitives[0]["attributes"]
+            vertices = _accessor(document, body, attributes["POSITION"])
+            feature = _accessor(document, body, attributes[f"_FEATURE_ID_{ids['attribute']}"]).ravel()
+            triangles = {
+                name: _accessor(document, body, one["indices"]).reshape(-1, 3).astype(np.int64)
+                for name, one in zip(names, primitives, strict=True)
+            }
+        position = vertices.astype(np.float64)
+        places = (UP @ matrix @ np.column_stack((position, np.ones(len(position)))).T).T[:, :3]
         table = _read_table(document, body, tables, tables["propertyTables"][ids["propertyTable"]])
         assert ids["featureCount"] == len(next(iter(table.values())))
-        parts[mesh["name"]] = Part(places, triangles, feature, table)
+        parts[mesh["name"]] = Part(places, triangles, feature.astype(np.int64), table)
     return document, parts
+
+
+def _unpack(
+    document: dict[str, Any], body: bytes, primitives: list[dict[str, Any]], names: list[str]
+) -> tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[np.int64]]]:
+    """Unpack primitives of Draco, one after the other."""
+    import DracoPy
+
+    places, features, triangles, n = [], [], {}, 0
+    for name, primitive in zip(names, primitives, strict=True):
+        packed = primitive["extensions"][PACKED]
+        mesh = DracoPy.decode(_view(document, body, packed["bufferView"]))
+        own = {one["unique_id"]: one["data"] for one in mesh.attributes}
+        assert {len(own[k]) for k in packed["attributes"].values()} == {len(mesh.points)}
+        for key, k in primitive["attributes"].items():
+            assert document["accessors"][k]["count"] == len(own[packed["attributes"][key]])
+        assert document["accessors"][primitive["indices"]]["count"] == mesh.faces.size
+        places.append(own[packed["attributes"]["POSITION"]])
+        features.append(own[packed["attributes"]["_FEATURE_ID_0"]].ravel())
+        triangles[name] = mesh.faces.astype(np.int64) + n
+        n += len(mesh.points)
+    return np.concatenate(places), np.concatenate(features), triangles
 
 
 def _accessor(document: dict[str, Any], body: bytes, k: int) -> NDArray[Any]:

@@ -636,6 +636,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
             "metavar": "FILE",
             "help": "blocks of `citystitch generalise`, which stand for houses in the upper levels of 3D Tiles",
         },
+        "compression": {"choices": ("draco",), "help": "pack the meshes of 3D Tiles (default: not)"},
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }
     for option, words in given.items():

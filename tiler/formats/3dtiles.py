@@ -6,6 +6,6 @@ from tiler.tiles3d.tileset import export_tileset
 FORMAT = Format(
     "3D Tiles 1.1: a quadtree of glTF with ids and attributes",
     export_tileset,
-    options=("geoid_height", "vertical_crs", "slice_height", "slice_line", "generalised"),
+    options=("geoid_height", "vertical_crs", "slice_height", "slice_line", "generalised", "compression"),
     folder=True,
 )

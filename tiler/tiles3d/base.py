@@ -63,12 +63,13 @@ class SortedPiece:
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A run as tiles see it: way to the globe, quadtree, and boundary."""
+    """A run as tiles see it: way to the globe, quadtree, boundary, and whether contents are packed by Draco."""
 
     site: Site
     grid: CellGrid
     surface: RunSurface
     crs: str
+    draco: bool = False
 
     def sort_piece(self, k: int) -> SortedPiece:
         """Read piece `k`, and sort its ground into cells by the middle of each facet."""
@@ -141,7 +142,7 @@ class Base:
     def _draw(self, layers: list[Layer], made: Made, error: float) -> Content | None:
         if not layers:
             return None
-        data, region = make_content(layers, self.site.globe, self._name)
+        data, region = make_content(layers, self.site.globe, self._name, draco=self.draco)
         return Content(data, Tile(region, error, content=True), made)
 
     def _name(self, material: int) -> str:

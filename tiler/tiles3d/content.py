@@ -1,13 +1,14 @@
 """The content of a tile: glTF 2.0 in one binary file, with features that tell what each vertex belongs to.
 
 Vertices are float32, counted from a place in the tile's middle, with x to the east, y up and z to the south there;
-the matrix of the root node puts them on the globe. Normals are bytes (KHR_mesh_quantization). Features stand in
-property tables (EXT_mesh_features, EXT_structural_metadata).
+the matrix of the root node puts them on the globe. Normals are bytes (KHR_mesh_quantization); with Draco
+(KHR_draco_mesh_compression), coordinates are whole steps of at most `STEP`. Features stand in property tables
+(EXT_mesh_features, EXT_structural_metadata).
 """
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +32,11 @@ from tiler.tiles3d.metadata import Blob, Column, add_table, describe_class
 Ints = NDArray[np.int64]
 Region = tuple[float, float, float, float, float, float]  # west, south, east, north (radians), lowest, highest (m)
 UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # from glTF's axes to those of tiles
-EXTENSIONS = ["EXT_mesh_features", "EXT_structural_metadata", "KHR_mesh_quantization"]
+EXTENSIONS = ["EXT_mesh_features", "EXT_structural_metadata"]
+BYTES, DRACO = "KHR_mesh_quantization", "KHR_draco_mesh_compression"  # and one of these
+STEP = 0.001  # m; of Draco's coordinates
+NORMAL_BITS, LEVEL = 8, 7  # of Draco's normals, and how hard it tries, of 10
+KINDS = {"POSITION": 0, "NORMAL": 1, "_FEATURE_ID_0": 4}  # Draco's types of attributes
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +86,9 @@ def join_surfaces(parts: list[Surface]) -> Surface:
     )
 
 
-def make_content(layers: list[Layer], globe: Globe, names: Callable[[int], str]) -> tuple[bytes, Region]:
+def make_content(
+    layers: list[Layer], globe: Globe, names: Callable[[int], str], *, draco: bool = False
+) -> tuple[bytes, Region]:
     """Make the content of a tile.
 
     Parameters
@@ -92,6 +99,8 @@ def make_content(layers: list[Layer], globe: Globe, names: Callable[[int], str])
         Where the coordinates lie.
     names : callable
         Gives the name of a material.
+    draco : bool
+        Whether meshes are packed by Draco.
 
     Returns
     -------
@@ -106,7 +115,8 @@ def make_content(layers: list[Layer], globe: Globe, names: Callable[[int], str])
     middle = (low + high) / 2
     frame = local_frame(float(middle[0]), float(middle[1]), float(low[2]))
     blob = Blob()
-    document = _Document(blob, sorted({int(m) for layer in layers for m in np.unique(layer.surface.material)}))
+    materials = sorted({int(m) for layer in layers for m in np.unique(layer.surface.material)})
+    document = _Document(blob, materials, draco=draco)
     for layer, own in zip(layers, places, strict=True):
         document.add(layer, into_frame(frame, geocentric(own))[:, [0, 2, 1]] * [1, 1, -1] + 0.0)
     matrix = UP.T @ frame @ UP + 0.0
@@ -128,8 +138,8 @@ def make_content(layers: list[Layer], globe: Globe, names: Callable[[int], str])
 class _Document:
     """The JSON of a content, layer by layer."""
 
-    def __init__(self, blob: Blob, materials: list[int]) -> None:
-        self._blob, self._materials = blob, materials
+    def __init__(self, blob: Blob, materials: list[int], *, draco: bool) -> None:
+        self._blob, self._materials, self._draco = blob, materials, draco
         self._accessors: list[dict[str, Any]] = []
         self._meshes: list[dict[str, Any]] = []
         self._classes: dict[str, Any] = {}
@@ -141,51 +151,94 @@ class _Document:
         surface = layer.surface
         drawn = _has_three_places(surface.triangles, position)
         triangles, of = surface.triangles[drawn], surface.material[drawn]
-        n = len(position)
-        attributes = {
-            "POSITION": self._accessor(
-                position, FLOAT, "VEC3", min=position.min(axis=0).tolist(), max=position.max(axis=0).tolist()
-            ),
-            "NORMAL": self._accessor(_normals(local, triangles, surface.skirt), BYTE, "VEC3", normalized=True),
-            "_FEATURE_ID_0": self._accessor(surface.feature.astype("<f4"), FLOAT, "SCALAR"),
-        }
         features = [{"featureCount": _count(layer.columns), "attribute": 0, "propertyTable": len(self._tables)}]
-        primitives = []
-        kind, dtype = (UNSIGNED_SHORT, "<u2") if n < 2**16 else (UNSIGNED_INT, "<u4")
-        for material in np.unique(of).tolist():
-            corners = triangles[of == material].astype(dtype).ravel()
-            view = self._blob.add(corners.tobytes(), target=INDICES)
-            self._accessors.append(
-                {"bufferView": view, "componentType": kind, "count": len(corners), "type": "SCALAR"}
-            )
-            primitives.append(
-                {
-                    "attributes": attributes,
-                    "indices": len(self._accessors) - 1,
-                    "material": self._materials.index(material),
-                    "extensions": {"EXT_mesh_features": {"featureIds": features}},
-                }
-            )
+        draw = self._pack if self._draco else self._lay
+        normals = _normals(local, triangles, surface.skirt)
+        primitives = [
+            primitive
+            | {
+                "material": self._materials.index(material),
+                "extensions": primitive.get("extensions", {}) | {"EXT_mesh_features": {"featureIds": features}},
+            }
+            for material, primitive in draw(position, normals, surface.feature, triangles, of)
+        ]
         self._meshes.append({"name": layer.name, "primitives": primitives})
         self._tables.append(add_table(self._blob, layer.name, layer.columns))
         self._classes[layer.name] = describe_class(layer.columns)
 
+    def _lay(
+        self, position: NDArray[np.float32], normals: NDArray[np.int8], feature: Ints, triangles: Ints, of: Ints
+    ) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Give materials and primitives, on vertices that they share."""
+        attributes = {
+            "POSITION": self._accessor(
+                position, FLOAT, "VEC3", min=position.min(axis=0).tolist(), max=position.max(axis=0).tolist()
+            ),
+            "NORMAL": self._accessor(normals, BYTE, "VEC3", normalized=True),
+            "_FEATURE_ID_0": self._accessor(feature.astype("<f4"), FLOAT, "SCALAR"),
+        }
+        kind, dtype = (UNSIGNED_SHORT, "<u2") if len(position) < 2**16 else (UNSIGNED_INT, "<u4")
+        for material in np.unique(of).tolist():
+            corners = triangles[of == material].astype(dtype).ravel()
+            view = self._blob.add(corners.tobytes(), target=INDICES)
+            indices = self._describe(kind, len(corners), "SCALAR", bufferView=view)
+            yield material, {"attributes": attributes, "indices": indices}
+
+    def _pack(
+        self, position: NDArray[np.float32], normals: NDArray[np.int8], feature: Ints, triangles: Ints, of: Ints
+    ) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Give materials and primitives, each packed with its vertices."""
+        import DracoPy  # not for those who do not ask for it
+
+        low = position.min(axis=0).tolist()
+        span = max(float(np.ptp(position, axis=0).max()), STEP)  # of all: what meets, still meets
+        number, dtype = (UNSIGNED_SHORT, np.uint16) if feature.max() < 2**16 else (FLOAT, np.float32)
+        for material in np.unique(of).tolist():
+            used, corner = np.unique(triangles[of == material], return_inverse=True)
+            data = DracoPy.encode(
+                position[used],
+                corner.reshape(-1, 3).astype(np.uint32),
+                quantization_bits=math.ceil(math.log2(span / STEP + 1)),
+                quantization_range=span,
+                quantization_origin=low,
+                compression_level=LEVEL,
+                normals=normals[used, :3] / 127.0,
+                normal_quantization_bits=NORMAL_BITS,
+                generic_attributes={0: feature[used, np.newaxis].astype(dtype)},
+            )
+            mesh = DracoPy.decode(data)  # which may have split or joined vertices
+            n, xyz = len(mesh.points), mesh.points
+            ends = {"min": xyz.min(axis=0).tolist(), "max": xyz.max(axis=0).tolist()}
+            attributes = {
+                "POSITION": self._describe(FLOAT, n, "VEC3", **ends),
+                "NORMAL": self._describe(FLOAT, n, "VEC3"),
+                "_FEATURE_ID_0": self._describe(number, n, "SCALAR"),
+            }
+            ids = {one["attribute_type"]: one["unique_id"] for one in mesh.attributes}
+            named = {name: ids[kind] for name, kind in KINDS.items()}
+            packed = {"bufferView": self._blob.add(data), "attributes": named}
+            indices = self._describe(UNSIGNED_INT, mesh.faces.size, "SCALAR")
+            yield material, {"attributes": attributes, "indices": indices, "extensions": {DRACO: packed}}
+
     def _accessor(self, values: NDArray[Any], component: int, kind: str, **words: Any) -> int:
         stride = {BYTE: 4}.get(component)
         view = self._blob.add(values.tobytes(), target=VERTICES, **({"byteStride": stride} if stride else {}))
-        self._accessors.append(
-            {"bufferView": view, "componentType": component, "count": len(values), "type": kind} | words
-        )
+        return self._describe(component, len(values), kind, bufferView=view, **words)
+
+    def _describe(self, component: int, n: int, kind: str, **words: Any) -> int:
+        first = {"bufferView": words.pop("bufferView")} if "bufferView" in words else {}
+        self._accessors.append(first | {"componentType": component, "count": n, "type": kind} | words)
         return len(self._accessors) - 1
 
     def finish(self, matrix: Array, size: int, names: Callable[[int], str]) -> dict[str, Any]:
         n = len(self._meshes)
         nodes = [{"mesh": k, "name": mesh["name"]} for k, mesh in enumerate(self._meshes)]
         schema = {"id": "citystitch", "classes": self._classes}
+        packed = DRACO if self._draco else BYTES
         return {
             "asset": {"version": "2.0", "generator": "citystitch"},
-            "extensionsUsed": EXTENSIONS,
-            "extensionsRequired": EXTENSIONS[2:],
+            "extensionsUsed": [*EXTENSIONS, packed],
+            "extensionsRequired": [packed],
             "extensions": {"EXT_structural_metadata": {"schema": schema, "propertyTables": self._tables}},
             "scene": 0,
             "scenes": [{"nodes": [n]}],

@@ -1,7 +1,8 @@
 """Slices through the volume mesh for tiles: at a height above the ground, or upright along a line, by cells."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,13 @@ class Slice:
     option: str
     height: float = 0.0
     line: tuple[float, float, float, float] | None = None
+
+
+class SliceWords(TypedDict, total=False):
+    """Where the volume mesh is cut: parameters of `make_slices` by the names of their options."""
+
+    slice_height: Sequence[float]
+    slice_line: Sequence[str]
 
 
 def make_slices(heights: list[float], lines: list[str]) -> list[Slice]:

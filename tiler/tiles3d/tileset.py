@@ -2,16 +2,18 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Unpack
 
 import numpy as np
 
-from pipeline.data.errors import InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.export.export import EXPORT_RECORD
 from tiler.mesh_files.run_files import RunFiles
 from tiler.store.atomic import replacing, replacing_folder
@@ -21,12 +23,13 @@ from tiler.tiles3d.blocks import BlockNames, deal_blocks
 from tiler.tiles3d.buildings import Part, load_parts, read_parts, write_part
 from tiler.tiles3d.cells import Cell, CellBuffers, encode
 from tiler.tiles3d.slices import ROW as SLICE_ROW
-from tiler.tiles3d.slices import cut_pieces, make_slices
+from tiler.tiles3d.slices import SliceWords, cut_pieces, make_slices
 from tiler.tiles3d.subtrees import TILESET, Tile, Tree, make_tileset, write_tree
 from tiler.tiles3d.terrain import ROW
 from tiler.tiles3d.update_state import UpdateState
 
 READ_AT_ONCE = 1000  # parts of buildings
+DRACO = "draco"
 
 
 def export_tileset(
@@ -35,10 +38,10 @@ def export_tileset(
     *,
     geoid_height: float = 0.0,
     vertical_crs: str = "",
-    slice_height: Sequence[float] = (),
-    slice_line: Sequence[str] = (),
     generalised: str = "",
+    compression: str = "",
     keep: UpdateState | None = None,
+    **cut_at: Unpack[SliceWords],
 ) -> list[str]:
     """Write a finished run as 3D Tiles 1.1.
 
@@ -50,12 +53,14 @@ def export_tileset(
         Files of the run.
     geoid_height, vertical_crs
         See `Globe`.
-    slice_height, slice_line
-        Where the volume mesh is cut: see `make_slices`.
     generalised : str
         GeoPackage of `citystitch generalise`, whose blocks stand for houses in the upper levels; none by default.
+    compression : str
+        How meshes are packed: ``draco`` or not at all.
     keep : UpdateState, optional
         Takes what an update of the tileset needs, see `tiler.tiles3d.update`.
+    slice_height, slice_line
+        Where the volume mesh is cut: see `make_slices`.
 
     Returns
     -------
@@ -65,7 +70,7 @@ def export_tileset(
     Raises
     ------
     ConfigError
-        As of `Globe` and `make_slices`.
+        As of `Globe` and `make_slices`; if the compression is unknown, or its package is missing.
     InputError
         If a file of the run is missing or damaged, or that of blocks is, or has no house of the run.
     OutputError
@@ -76,8 +81,13 @@ def export_tileset(
     Memory: a tile of the run, then the contents of the cells on one way down the tree, and the lowest wall of each
     building. Data of all cells wait in a temporary folder beside the output.
     """
+    if compression not in ("", DRACO):
+        raise ConfigError(f"--compression {compression}: expected {DRACO}, or none; change it")
+    if compression and find_spec("DracoPy") is None:
+        raise ConfigError(f"--compression {DRACO} needs DracoPy: pip install 'citystitch[{DRACO}]'")
     base = open_base(files, geoid_height=geoid_height, vertical_crs=vertical_crs)
-    slices = make_slices(list(slice_height), list(slice_line))
+    base = replace(base, draco=compression == DRACO)
+    slices = make_slices(list(cut_at.get("slice_height", ())), list(cut_at.get("slice_line", ())))
     globe, grid = base.site.globe, base.grid
     told: Counter[str] = Counter()
     with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".cells.") as name:

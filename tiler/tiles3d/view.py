@@ -13,7 +13,7 @@ from typing import Any
 from tornado.web import StaticFileHandler
 
 from pipeline.data.errors import InputError
-from tiler.dashboard.handlers import Guarded
+from tiler.dashboard.handlers import POLICY, Guarded
 from tiler.dashboard.server import serve_rules
 from tiler.store.out_folder import RUN_RECORD
 from tiler.tiles3d.subtrees import TILESET
@@ -32,8 +32,10 @@ class Files(Guarded, StaticFileHandler):
         return f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"'
 
     def set_extra_headers(self, _path: str) -> None:
-        """Let nothing be used again unasked."""
+        """Let nothing be used again unasked, and the decoder of Draco run: WebAssembly, in a worker."""
         self.set_header("Cache-Control", "no-cache")
+        policy = POLICY.replace("script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'") + "; worker-src blob:"
+        self.set_header("Content-Security-Policy", policy)
 
 
 @contextmanager

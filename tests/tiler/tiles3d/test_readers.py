@@ -33,6 +33,14 @@ def tiles(sloped_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def packed(sloped_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, packed by Draco."""
+    path = tmp_path_factory.mktemp("packed") / "tiles"
+    export_run(sloped_run, path, name="3dtiles", options={"compression": "draco"})
+    return path
+
+
 def run_script(name: str, *words: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Run a script of node with the packages of all users; gives what it prints last."""
     monkeypatch.setenv("NODE_PATH", str(node_modules(folder)))
@@ -85,7 +93,11 @@ def test_the_server_gives_out_the_folder_alone(tiles: Path) -> None:
 
 
 @pytest.mark.long
-def test_tools_and_validator_read_the_same_tree(tiles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", ["tiles", "packed"])
+def test_tools_and_validator_read_the_same_tree(
+    kind: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiles: Path = request.getfixturevalue(kind)
     found = run_script("read_tiles.mjs", str(tiles), folder=tiles, monkeypatch=monkeypatch)
     assert found["messages"] == []
     wanted = {
@@ -106,15 +118,16 @@ def test_the_validator_sees_a_broken_content(tiles: Path, tmp_path: Path, monkey
 
 @pytest.mark.long
 def test_browsers_show_the_city(
-    sloped_run: Path, tiles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sloped_run: Path, tiles: Path, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Our page those of Draco, CesiumJS the others."""
     chromium = os.environ.get("CHROMIUM", "/usr/bin/chromium")
     site = tmp_path / "site"
     site.mkdir()
     (site / "cesium").symlink_to(node_modules(tmp_path) / "cesium/Build/Cesium")
     (site / "tiles").symlink_to(tiles)
     shutil.copy(HELPERS / "cesium.html", site)
-    with serve_tiles(tiles, "127.0.0.1:0") as url, serve_folder(site) as root:
+    with serve_tiles(packed, "127.0.0.1:0") as url, serve_folder(site) as root:
         words = (url, f"{root}/cesium.html", chromium, str(tmp_path))
         seen = run_script("browse_tiles.mjs", *words, folder=tmp_path, monkeypatch=monkeypatch)
     assert "error" not in seen, seen["error"]

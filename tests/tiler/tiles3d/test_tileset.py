@@ -10,6 +10,7 @@ import pyogrio
 import pyproj
 import pytest
 import shapely
+from scipy.spatial import cKDTree
 
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.mesh import Marker
@@ -157,6 +158,30 @@ def test_blocks_stand_for_houses_in_the_upper_levels(
     generalise(Inputs(footprints=write(tmp_path / "one.gpkg", shapely.box(0, 0, 9, 9), ids=["x"])), other, Asked())
     with pytest.raises(InputError, match=r"other\.gpkg: has no building of the run"):
         export_run(sloped_run, tmp_path / "no", name="3dtiles", options={"generalised": str(other)})
+
+
+def test_draco_moves_no_vertex_by_a_millimetre_and_keeps_features(
+    sloped_run: Path, tiles: Path, tmp_path: Path
+) -> None:
+    given = {"compression": "draco", "geoid_height": GEOID}
+    export_run(sloped_run, tmp_path / "packed", name="3dtiles", options=given)
+    before = {cell: read_content(path)[1] for cell, path in contents(tiles)}
+    for cell, path in contents(tmp_path / "packed"):
+        document, parts = read_content(path)
+        assert document["extensionsRequired"] == ["KHR_draco_mesh_compression"]
+        for name, part in parts.items():
+            old = before[cell][name]
+            assert part.table == old.table
+            for material, triangles in old.triangles.items():
+                assert len(part.triangles[material]) == len(triangles)
+                sides = [(one.places, one.feature, one.triangles[material].ravel()) for one in (old, part)]
+                # Of another feature is far away.
+                a, b = (np.column_stack((xyz, 1e3 * feature))[used] for xyz, feature, used in sides)
+                assert max(np.max(cKDTree(a).query(b)[0]), np.max(cKDTree(b).query(a)[0])) < 1e-3
+    sizes = [sum(path.stat().st_size for _, path in contents(one)) for one in (tiles, tmp_path / "packed")]
+    assert sizes[1] < 0.5 * sizes[0]
+    with pytest.raises(ConfigError, match="--compression zip: expected draco"):
+        export_run(sloped_run, tmp_path / "no", name="3dtiles", options={"compression": "zip"})
 
 
 def test_the_same_run_gives_the_same_bytes(sloped_run: Path, tiles: Path, tmp_path: Path) -> None:

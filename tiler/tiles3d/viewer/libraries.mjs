@@ -3,6 +3,7 @@ export {
   Box3, BufferAttribute, BufferGeometry, Color, DirectionalLight, HemisphereLight, Line, LineBasicMaterial,
   Mesh, MeshLambertMaterial, PerspectiveCamera, Plane, Raycaster, Scene, Sphere, Vector2, Vector3, WebGLRenderer,
 } from "three";
+export { DRACOLoader } from "three/examples/jsm/loaders/DRACOLoader.js";
 export { MapControls } from "three/examples/jsm/controls/MapControls.js";
 export { TilesRenderer } from "3d-tiles-renderer/three";
 export { ImplicitTilingPlugin } from "3d-tiles-renderer/core/plugins";

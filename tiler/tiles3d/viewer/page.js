@@ -1,6 +1,6 @@
 // The city of a folder of 3D Tiles: streamed, coloured, picked and measured.
 import {
-  Box3, BufferAttribute, BufferGeometry, Color, DirectionalLight, GLTFExtensionsPlugin, HemisphereLight, ImplicitTilingPlugin,
+  Box3, BufferAttribute, BufferGeometry, Color, DirectionalLight, DRACOLoader, GLTFExtensionsPlugin, HemisphereLight, ImplicitTilingPlugin,
   Line, LineBasicMaterial, MapControls, Mesh, MeshLambertMaterial, PerspectiveCamera, Plane, Raycaster, ReorientationPlugin, Scene, Sphere,
   TilesRenderer, Vector2, Vector3, WebGLRenderer,
 } from "./libraries.js";
@@ -87,10 +87,11 @@ function showLegend() {
   for (const [key, colour] of state.classes) add(`#${colour.getHexString()}`, key);
 }
 
+const dracoLoader = new DRACOLoader().setDecoderPath("./"); // read when the first tile needs it
 function openTiles(place) {
   const own = new TilesRenderer("tiles/tileset.json");
   own.registerPlugin(new ImplicitTilingPlugin());
-  own.registerPlugin(new GLTFExtensionsPlugin({ metadata: true }));
+  own.registerPlugin(new GLTFExtensionsPlugin({ metadata: true, dracoLoader, autoDispose: false }));
   if (place) for (const key of ["position", "quaternion", "scale"]) own.group[key].copy(place[key]);
   else own.registerPlugin(new ReorientationPlugin());
   own.errorTarget = 5; // pixels
@@ -202,7 +203,7 @@ function showFeature(mesh, row) {
   get("facts").replaceChildren(...Object.entries(facts).filter(([key, value]) => key !== "id" && value !== "" && value !== NO_NUMBER).map(([key, value]) => {
     const line = document.createElement("tr"), head = document.createElement("th"), cell = document.createElement("td");
     head.textContent = key.replaceAll("_", " ");
-    cell.textContent = typeof value === "number" ? value.toFixed(2) : value;
+    cell.textContent = typeof value === "number" ? value.toFixed(key === "buildings" ? 0 : 2) : value;
     line.append(head, cell);
     return line;
   }));
