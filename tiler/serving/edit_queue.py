@@ -36,6 +36,8 @@ class EditQueue:
         client of Dask must be.
     say : callable
         Called with sentences that the user should read.
+    at_rest : callable
+        Called when no edit has come for a while: it makes the tiles that were left as they were.
 
     Attributes
     ----------
@@ -53,8 +55,10 @@ class EditQueue:
         after: Callable[[int], None],
         open_executor: Callable[[], AbstractContextManager[Executor | None]] = nullcontext,
         say: Callable[[str], None] = say_nothing,
+        at_rest: Callable[[], None] = lambda: None,
     ) -> None:
         self._city, self._after, self._open_executor, self._say = city, after, open_executor, say
+        self._at_rest = at_rest
         self._changed = threading.Condition()
         self._waiting: list[tuple[Asked, Future[Outcome]]] = []
         self._at_work: list[tuple[Asked, Future[Outcome]]] = []
@@ -139,10 +143,10 @@ class EditQueue:
                 self._follow(lambda: self._after(self.revision))
                 self.state = FILES
             elif not calm:
-                late, calm = bool(self.trouble), True
+                calm = True
                 self._follow(lambda: write_city_files(self._city, executor))
-                if late:  # all tiles are made of these files
-                    self._follow(lambda: self._after(self.revision))
+                if not self.trouble:  # of these files tiles are made that could not be followed
+                    self._follow(self._at_rest)
                 self.state = REST
 
     def _follow(self, work: Callable[[], None]) -> None:

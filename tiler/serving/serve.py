@@ -20,7 +20,7 @@ from tiler.serving.edit_queue import EditQueue
 from tiler.serving.handlers import COOKIE, CityState, EditList, Keyed, OneEdit, Service, cookie_of
 from tiler.serving.section import Section
 from tiler.tiles3d.globe import Globe
-from tiler.tiles3d.update import TILES, update_tileset
+from tiler.tiles3d.update import MERGING_LEVEL, TILES, update_tileset
 from tiler.tiles3d.view import PAGE, Files
 from tiler.words.plain_text import say_nothing
 
@@ -112,15 +112,15 @@ def serve_city(
         )
     folder, given = directory / FOLDER, placed or Placed()
 
-    def write_tiles(_: int) -> None:
-        update_tileset(folder, find_files(directory), **vars(given))
+    def write_tiles(merging_level: float = 0.0) -> None:
+        update_tileset(folder, find_files(directory), merging_level=merging_level, **vars(given))
 
     with ExitStack() as stack:
         city = stack.enter_context(held_city(directory, workers, say))
         write_city_files(city)  # which a killed server has left
-        write_tiles(0)
+        write_tiles()
         open_executor = partial(_warm_executor, workers, city.config) if workers else nullcontext
-        queue = EditQueue(city, write_tiles, open_executor, say)
+        queue = EditQueue(city, lambda _: write_tiles(MERGING_LEVEL), open_executor, say, at_rest=write_tiles)
         service, globe = Service(city, queue, token), Globe(city.crs, city.bounds, **vars(given))
 
         def rules(loopback: bool) -> list[Any]:

@@ -32,14 +32,23 @@ from tiler.tiles3d.update_state import (
     hash_rows,
     lowest_ground,
     make_run_tile,
+    measure_change,
     read_stamps,
 )
 
 TILES, MADE = "tiles", "made"  # below the folder: the tileset, and what is kept beside it
 SCHEMA = 2  # version of the latter
+MERGING_LEVEL = 0.03
 
 
-def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, vertical_crs: str = "") -> int:
+def update_tileset(
+    folder: Path,
+    files: RunFiles,
+    *,
+    geoid_height: float = 0.0,
+    vertical_crs: str = "",
+    merging_level: float = 0.0,
+) -> int:
     """Bring the tileset of a run up to date; of a new folder, or another run, make all of it.
 
     Parameters
@@ -50,6 +59,9 @@ def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, 
         Files of the run.
     geoid_height, vertical_crs
         See `tiler.tiles3d.tileset.export_tileset`.
+    merging_level : float
+        Share of a cell below which a change does not go further up, see `measure_change`; `MERGING_LEVEL` is that
+        of the paper. All changes together that a cell has not handed up are below it.
 
     Returns
     -------
@@ -63,15 +75,20 @@ def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, 
 
     Notes
     -----
-    The bytes are those of a whole export. A cell above is made anew where what a cell below hands up has changed;
-    from there on all above keep theirs. Killed in between, the next call makes all of it.
+    A cell above is made anew where what a cell below hands up has changed; from there on all above keep theirs.
+    With a merging level of 0, the bytes are those of a whole export, whatever was held back before. Killed in
+    between, the next call makes all of it.
+
+    References
+    ----------
+    E. Gobbetti and others: *Reconstructing and exploring massive detailed cityscapes* (2011): the merging level.
     """
     base = open_base(files, geoid_height=geoid_height, vertical_crs=vertical_crs)
     state = [SCHEMA, geoid_height, vertical_crs, base.crs, list(base.site.bounds), base.site.tiles.tolist()]
     state += [list(base.surface.names), list(base.surface.ground)]
     kept = UpdateState(folder / MADE, state)
     if kept.is_sound():
-        return _Update(base, files, kept, folder / TILES).run()
+        return _Update(base, files, kept, folder / TILES, merging_level).run()
     with replacing_folder(folder) as new:
         kept = UpdateState(new / MADE, state)
         export_tileset(new / TILES, files, geoid_height=geoid_height, vertical_crs=vertical_crs, keep=kept)
@@ -81,7 +98,8 @@ def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, 
 class _Update:
     """One update."""
 
-    def __init__(self, base: Base, files: RunFiles, kept: UpdateState, folder: Path) -> None:
+    def __init__(self, base: Base, files: RunFiles, kept: UpdateState, folder: Path, merging_level: float) -> None:
+        self._merging_level = merging_level
         self._base, self._files, self._kept, self._folder = base, files, kept, folder
         self._store = Store(files.directory / STORE)
         self._pieces: dict[str, SortedPiece] = {}  # those that were read
@@ -95,7 +113,8 @@ class _Update:
         stamps = read_stamps(self._files)
         old = {name: kept.read_run(name) for name in names}
         changed = [name for name in names if (old[name].model, old[name].boundary) != stamps[name]]
-        if not changed:
+        late = [] if self._merging_level else kept.late_cells()
+        if not changed and not late:
             return 0
         kept.begin()
         new = dict(old)
@@ -127,7 +146,7 @@ class _Update:
                 }
                 new[name] = RunTile(**(vars(new[name]) | {"parts": kept_parts}))
         self._tree = kept.read_tree()
-        self._make(sorted(dirty | came.keys()), new, gone, came)
+        self._make(sorted(dirty | came.keys()), new, gone, came, {cell: kept.read_cell(cell) for cell in late})
         self._finish()
         for name in names:
             if new[name] is not old[name]:
@@ -166,11 +185,18 @@ class _Update:
             return touched, list(read_parts(path, lowest, Counter())), rows
 
     def _make(
-        self, dirty: list[int], new: Mapping[str, RunTile], gone: Collection[str], came: Mapping[int, list[Part]]
+        self,
+        dirty: list[int],
+        new: Mapping[str, RunTile],
+        gone: Collection[str],
+        came: Mapping[int, list[Part]],
+        handed: dict[Cell, Made | None],
     ) -> None:
-        """Make the smallest cells of some codes, then those above as far as something changes."""
+        """Make the smallest cells of some codes, then those above as far as something changes.
+
+        `handed` has what cells hand up that differs from before.
+        """
         base, depth = self._base, self._base.grid.depth
-        handed: dict[Cell, Made | None] = {}  # what differs from before
         for code in dirty:
             cell = (depth, *decode(code))
             there = self._kept.read_cell(cell)
@@ -193,6 +219,7 @@ class _Update:
         level, x, y = cell
         for row, column in product((0, 1), (0, 1)):
             child = level + 1, 2 * x + column, 2 * y + row
+            self._kept.release(child)
             made = handed[child] if child in handed else self._kept.read_cell(child)
             if made is not None:
                 yield (column, row), made
@@ -200,7 +227,7 @@ class _Update:
     def _put(self, cell: Cell, content: Content | None, handed: dict[Cell, Made | None]) -> None:
         """Write a cell, or take it away, and note whether it hands up something else than before."""
         self._made += 1
-        path = content_path(self._folder, cell)
+        path, before = content_path(self._folder, cell), self._kept.read_handed(cell)
         if content is None:
             path.unlink(missing_ok=True)
             self._kept.remove(cell)
@@ -211,7 +238,10 @@ class _Update:
             write_content(self._folder, cell, content.data)
         self._tree[cell] = content.tile
         if self._kept.save(cell, content.made):
-            handed[cell] = content.made
+            if before is not None and measure_change(before, content.made) < self._merging_level:
+                self._kept.hold(cell, before)
+            else:
+                handed[cell] = content.made
 
     def _finish(self) -> None:
         """Write tree and root."""

@@ -6,6 +6,7 @@
     origin.json                 origin of the city model, from where coordinates of buildings were counted
     tree.json                   what the tree tells of each cell by itself
     cells/{level}/{x}/{y}.json  what a cell hands to the one above it
+    late/{level}/{x}/{y}.json   what it handed to that before, where the one above was not made anew since
     runs/{tile}.json            what cells took from a tile of the run
 """
 
@@ -31,6 +32,8 @@ from tiler.tiles3d.subtrees import Tile
 from tiler.tiles3d.terrain import Lattice
 from tiler.workflow.audit import Entry, read_manifest
 
+LATE = "late"
+MOVED = 0.1  # m
 MODEL = "model"  # stage of the buildings that a tile owns, as they are meshed
 
 
@@ -123,13 +126,32 @@ class UpdateState:
 
     def save(self, cell: Cell, made: Made) -> bool:
         """Keep what a cell hands up; returns whether it differs from what it handed up before."""
-        lattice = {"height": made.lattice.height.tolist(), "error": made.lattice.error}
-        return self._write(_name(cell), {"lattice": lattice, "units": [_unit(unit) for unit in made.units]})
+        return self._write(_name(cell), _describe(made))
 
     def read_cell(self, cell: Cell) -> Made | None:
         """Read what a cell hands up; None where there is no such cell."""
+        return self._read_made(_name(cell))
+
+    def read_handed(self, cell: Cell) -> Made | None:
+        """Read what the cell above was made of; None where there was no such cell."""
+        return self._read_made(_name(cell, LATE)) or self.read_cell(cell)
+
+    def hold(self, cell: Cell, before: Made) -> None:
+        """Keep what the cell above was made of, as it is not made anew though a cell has changed."""
+        self._write(_name(cell, LATE), _describe(before))
+
+    def release(self, cell: Cell) -> None:
+        """Forget that: the cell above is made anew."""
+        (self._folder / f"{_name(cell, LATE)}.json").unlink(missing_ok=True)
+
+    def late_cells(self) -> list[Cell]:
+        """List the cells that have changed since the one above was made."""
+        paths = (self._folder / LATE).glob("*/*/*.json")
+        return sorted((int(path.parts[-3]), int(path.parts[-2]), int(path.stem)) for path in paths)
+
+    def _read_made(self, name: str) -> Made | None:
         try:
-            found = self._read(_name(cell))
+            found = self._read(name)
         except FileNotFoundError:
             return None
         lattice = Lattice(np.array(found["lattice"]["height"], np.float64), found["lattice"]["error"])
@@ -207,8 +229,32 @@ def hash_rows(arrays: Arrays) -> dict[str, tuple[str, int, str]]:
     }
 
 
-def _name(cell: Cell) -> str:
-    return "cells/{}/{}/{}".format(*cell)
+def measure_change(before: Made, after: Made) -> float:
+    """Give the share of a cell that has changed: of walls and roofs by area or of nodes of its ground, the larger.
+
+    A building that takes the place of another one counts once, and a node that moved by more than `MOVED`.
+    """
+    old, new = (
+        {
+            json.dumps(_unit(unit)): unit.outline.area + unit.outline.length * (unit.high - unit.bottom)
+            for unit in some
+        }
+        for some in (before.units, after.units)
+    )
+    gone, came = (sum(own[key] for key in own.keys() - other) for own, other in ((old, new), (new, old)))
+    whole = max(sum(old.values()), sum(new.values()))
+    a, b = before.lattice.height, after.lattice.height
+    moved = (np.isnan(a) != np.isnan(b)) | (abs(a - b) > MOVED)
+    return max(max(gone, came) / whole if whole else 0.0, float(moved.mean()))
+
+
+def _name(cell: Cell, kind: str = "cells") -> str:
+    return "{}/{}/{}/{}".format(kind, *cell)
+
+
+def _describe(made: Made) -> dict[str, Any]:
+    lattice = {"height": made.lattice.height.tolist(), "error": made.lattice.error}
+    return {"lattice": lattice, "units": [_unit(unit) for unit in made.units]}
 
 
 def _unit(unit: Unit) -> dict[str, Any]:

@@ -34,12 +34,20 @@ def test_an_updated_tileset_has_the_bytes_of_a_whole_one(
     (gone, _), (moved, shape), *_ = sorted(houses.items(), key=lambda one: sum(one[1].bounds))  # in one corner
     new = write(tmp_path / "new.gpkg", affinity.scale(shape, 0.7, 0.9), ids=["x"])
     tiler.open(city).remove(gone).replace(moved, new)
-    n_made = update_tileset(view, find_files(city))
+    files = find_files(city)
+    n_few = update_tileset(view, files, merging_level=1.1)  # nothing goes up from the smallest cells
+    held = read_all(view / TILES)
+    differing = {path for path in held if path.endswith("glb") and held[path] != before.get(path)}
+    depth = max(int(path.split("/")[1]) for path in held if path.endswith("glb"))
+    assert {int(path.split("/")[1]) for path in differing} == {depth}
+    assert update_tileset(view, files, merging_level=0.03) == 0  # of no new edit
+    n_made = n_few + update_tileset(view, files)
     export_run(city, tmp_path / "second", name="3dtiles")
     after = read_all(view / TILES)
     assert after == read_all(tmp_path / "second")
     assert len([path for path in after if after[path] != before.get(path)]) > 0
-    assert n_made < n_cells
+    assert n_few < n_made < n_cells
+    assert not list((view / MADE).glob("late/*/*/*"))
     again = shutil.copytree(view, tmp_path / "again")
     shutil.rmtree(again)
     update_tileset(again, find_files(city))
