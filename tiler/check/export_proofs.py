@@ -13,12 +13,11 @@ from pipeline.data.errors import ConfigError, InputError
 from stitch.pieces import conformity
 from tiler.check.check import CheckReport
 from tiler.check.proofs import RELATIVE_TOLERANCE, SIDE_TOLERANCE, Fault, Proof, Vertices, find_faults
-from tiler.export.foam_files import read_foam_faces, read_foam_list
-from tiler.export.foam_patches import POLY_MESH
+from tiler.export.foam_files import POLY_MESH, read_foam_faces, read_foam_list
 from tiler.export.region_faces import find_outer
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import list_faces
-from tiler.mesh_files.transitions import NO_CORNER
+from tiler.mesh_files.transitions import NO_CORNER, turn_over
 
 Ints = NDArray[np.int64]
 SHAPES = {"prisms": 53, "pyramids": 51, "tetrahedra": 40}  # faces, and those of four corners
@@ -119,8 +118,7 @@ def _read_foam(folder: Path) -> Polyhedra:
     points, faces = read_foam_list(folder / "points", 3), read_foam_faces(folder / "faces")
     owner, neighbour = (read_foam_list(folder / name, 1)[:, 0] for name in ("owner", "neighbour"))
     inner = faces[: len(neighbour)]
-    back = np.where(inner[:, 3:] == NO_CORNER, inner[:, [0, 2, 1, 3]], inner[:, [0, 3, 2, 1]])
-    mesh = Polyhedra(points, np.concatenate((faces, back)), np.concatenate((owner, neighbour)))
+    mesh = Polyhedra(points, np.concatenate((faces, turn_over(inner))), np.concatenate((owner, neighbour)))
     mesh = _checked(folder, mesh)
     if not (number := folder / "pointProcAddressing").exists():
         return mesh

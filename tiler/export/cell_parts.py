@@ -25,6 +25,7 @@ from tiler.export.region_faces import (
     wrong_ground,
 )
 from tiler.mesh_files.mesh_pieces import MeshPiece
+from tiler.mesh_files.transitions import fill_corners
 
 Ids = NDArray[np.int32]
 
@@ -77,7 +78,8 @@ class ColumnsFile:
         """Add the columns of a piece."""
         with self._path.open("ab") as file:
             for first in range(0, len(piece.cells), BLOCK_CELLS):
-                columns = count_columns(piece.points, piece.cells[first : first + BLOCK_CELLS])
+                cells = fill_corners(piece.cells[first : first + BLOCK_CELLS])
+                columns = count_columns(piece.points, cells)
                 columns.tofile(file)
                 self._n += len(columns)
 
@@ -177,7 +179,7 @@ def divide_cells(
 
 
 def _assign(cuts: Cuts, piece: MeshPiece, first: int, end: int) -> Ints:
-    return cuts.part_of(column_centres(piece.points, piece.cells[first:end]))
+    return cuts.part_of(column_centres(piece.points, fill_corners(piece.cells[first:end])))
 
 
 def _ranks(part: Ints, n_parts: int) -> Ints:
@@ -195,7 +197,7 @@ def _part_of_facets(cuts: Cuts, piece: MeshPiece, faces: CellFaces, own: Ids) ->
     outer = find_outer(piece)
     part[outer] = own[faces.facet_cell]
     # The ground between air and soil is as wide as its column.
-    part[~outer] = cuts.part_of(column_centres(piece.points, piece.facets[~outer]))
+    part[~outer] = cuts.part_of(column_centres(piece.points, fill_corners(piece.facets[~outer])))
     return part
 
 

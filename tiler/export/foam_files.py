@@ -1,6 +1,7 @@
 """Files of OpenFOAM: headers, and long lists in binary, written in any order of their rows."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from tiler.export.pieces import blocks_of, slices
+from tiler.mesh_files.transitions import NO_CORNER
 
+POLY_MESH = "constant/polyMesh"
 BANNER = "// Written by citystitch.\n"
 LABEL_LIMIT = 2**31 - 1  # numbers that a 32 bit label can hold
 COUNT_WIDTH = 20  # characters of a count that is known when its list is whole
@@ -107,18 +110,16 @@ class FoamFaces:
     ----------
     path : Path
         The file.
-    location : str
-        Folder of it within the case.
     label : int
         Bits of an integer.
     n : int
         Number of faces.
     """
 
-    def __init__(self, path: Path, *, location: str, label: int, n: int) -> None:
+    def __init__(self, path: Path, *, label: int, n: int) -> None:
         self._dtype = np.dtype(f"<i{label // 8}")
         self._file: BinaryIO = path.open("wb")
-        header = foam_header("faces", "faceCompactList", location=location, binary=True, label=label)
+        header = foam_header("faces", "faceCompactList", location=POLY_MESH, binary=True, label=label)
         self._file.write(f"{header}{n + 1}\n(".encode())
         for some in slices(n + 1):
             self._file.write((3 * np.arange(some.start, some.stop)).astype(self._dtype).data)
@@ -143,6 +144,54 @@ class FoamFaces:
 
     def _seek(self, face: int) -> None:
         self._file.seek(self._start + 3 * face * self._dtype.itemsize)
+
+
+class FoamPolygons:
+    """The file ``faces`` of triangles and quadrilaterals; until all are there they wait in a file beside it.
+
+    Parameters are those of `FoamFaces`.
+    """
+
+    def __init__(self, path: Path, *, label: int, n: int) -> None:
+        self._dtype, self._path, self._n = np.dtype(f"<i{label // 8}"), path, n
+        self._header = foam_header("faces", "faceCompactList", location=POLY_MESH, binary=True, label=label)
+        self._wait: BinaryIO = path.with_suffix(".wait").open("w+b")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self._join()
+        self._wait.close()
+        self._path.with_suffix(".wait").unlink()
+
+    def write(self, start: int, corners: NDArray[Any]) -> None:
+        """Write the vertices (k, 4) of faces from number `start` on; triangles end with `NO_CORNER`."""
+        self._wait.seek(4 * start * self._dtype.itemsize)
+        self._wait.write(np.ascontiguousarray(corners, self._dtype).data)
+
+    def _join(self) -> None:
+        """Write where each face begins, then the corners of all."""
+        end = 0
+        with self._path.open("wb") as file:
+            file.write(f"{self._header}{self._n + 1}\n(".encode())
+            file.write(np.zeros(1, self._dtype).data)
+            for rows in self._rows():
+                ends = end + np.cumsum((rows != NO_CORNER).sum(axis=1))
+                file.write(ends.astype(self._dtype).data)
+                end = int(ends[-1])
+            file.write(f")\n{end}\n(".encode())
+            for rows in self._rows():
+                file.write(rows[rows != NO_CORNER].data)
+            file.write(b")\n")
+
+    def _rows(self) -> Iterator[NDArray[Any]]:
+        self._wait.seek(0)
+        for some in slices(self._n):
+            yield np.fromfile(self._wait, self._dtype, 4 * (some.stop - some.start)).reshape(-1, 4)
 
 
 def read_foam_list(path: Path, width: int) -> NDArray[Any]:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from stitch.pieces.cell_faces import CellFaces
 from tiler.export.cell_parts import CellParts
-from tiler.export.foam_files import FoamFaces, FoamList, foam_header
+from tiler.export.foam_files import POLY_MESH, FoamFaces, FoamList, FoamPolygons, foam_header
 from tiler.export.foam_patches import (
     FIRST_LEAVES,
     GROUND_ZONE,
-    POLY_MESH,
     ZonesFile,
     add_all_leaves,
     cell_zone_name,
@@ -37,10 +36,13 @@ from tiler.export.region_faces import (
     find_inner_ground,
     find_outer,
     lowest_first,
+    number_corners,
     own_faces,
     wrong_ground,
 )
 from tiler.mesh_files.mesh_pieces import MeshPiece
+from tiler.mesh_files.prisms import find_centres
+from tiler.mesh_files.transitions import fill_corners, turn_over
 
 DISTANCES = np.logspace(-4, 3, 281)  # m; bins of 6 %
 
@@ -111,6 +113,8 @@ class FoamPlan:
     heights : Path, optional
         A folder for the heights of the centres of cells (m), float64: a file for each part by its number, and for
         two parts ``a`` and ``b`` that meet a file ``a-b`` of the cells of ``a`` at their faces, in their order.
+    polygons : bool
+        Whether faces may have four corners.
     """
 
     pieces: Pieces
@@ -124,6 +128,7 @@ class FoamPlan:
     label: int
     heights: Path | None = None
     volume_keys: Callable[[MeshPiece], Ints] = no_keys
+    polygons: bool = False
 
 
 class PointPlaces:
@@ -221,7 +226,11 @@ class _PartWriter:
         self._near: dict[str, Ints] = {}
         self._leaves: Counter[int] = Counter()
         n = numbers.n_faces
-        self._faces = stack.enter_context(FoamFaces(folder / "faces", location=POLY_MESH, label=plan.label, n=n))
+        self._faces: FoamFaces | FoamPolygons
+        if plan.polygons:
+            self._faces = stack.enter_context(FoamPolygons(folder / "faces", label=plan.label, n=n))
+        else:
+            self._faces = stack.enter_context(FoamFaces(folder / "faces", label=plan.label, n=n))
         n_points = plan.pieces.n_points if places is None else None
         self._points = self._open("points", n=n_points, kind="vectorField", dtype="f8", width=3)
         self._owner, self._neighbour = self._open("owner", n=n), self._open("neighbour", n=numbers.n_inner)
@@ -261,9 +270,7 @@ class _PartWriter:
             self._leaves.update(keys[keys >= FIRST_LEAVES].tolist())
         if self._heights is not None:
             rows = slice(0, len(piece.cells)) if isinstance(cells, slice) else cells - start
-            z = piece.points[:, 2]
-            low, high = (z[piece.cells[rows, k]] + z[piece.cells[rows, k + 1]] for k in (0, 2))
-            ((low + high) / 4).tofile(self._heights)
+            find_centres(piece.points[:, 2:], piece.cells[rows]).tofile(self._heights)
             if piece.leaves is not None and self._plan.heights is not None:
                 with leaves_beside(self._plan.heights / str(self.numbers.number)).open("ab") as file:
                     piece.leaves[rows].astype("<f8").tofile(file)
@@ -311,7 +318,7 @@ class _PartWriter:
         if isinstance(cells, slice):
             cells = np.arange(cells.start, cells.stop)
         is_used = np.zeros(len(piece.points), np.bool_)
-        is_used[piece.cells[cells - start]] = True
+        is_used[fill_corners(piece.cells[cells - start])] = True
         used = np.flatnonzero(is_used)
         number, fresh = self._places.add(piece.ids[used])
         self._points.append(piece.points[used[fresh]])
@@ -352,7 +359,7 @@ class _PartWriter:
         """Write faces of a piece; returns which are inside the part."""
         parts, number = self._plan.parts, self.numbers.number
         low, high = parts.part_of(own.owner), parts.part_of(own.neighbour)
-        corners = local[own.corners]
+        corners = number_corners(local, own.corners)
         inside: NDArray[np.bool_] = (low == number) & (high == number)
         self._faces.write(self._row, corners[inside])
         self._owner.write(self._row, parts.place_of(own.owner[inside]))
@@ -362,7 +369,7 @@ class _PartWriter:
             out = ~inside
             # Of a face whose lower cell is in another part the upper one is the owner here, so it is turned.
             turned = high[out] == number
-            corners = np.where(turned[:, None], corners[out][:, [0, 2, 1]], corners[out])
+            corners = np.where(turned[:, None], turn_over(corners[out]), corners[out])
             owner = parts.place_of(np.where(turned, own.neighbour[out], own.owner[out]))
             other = np.where(turned, low[out], high[out]).astype(np.int64)
             self._across.append(_Across(other, own.number[out], turned, owner, corners))
@@ -377,7 +384,7 @@ class _PartWriter:
         other = parts.part_of(lower[turned])
         chosen = (parts.part_of(cell[turned]) == number) & (other != number)
         turned, other = turned[chosen], other[chosen].astype(np.int64)
-        corners = local[lowest_first(faces.shared[turned], piece.ids)]
+        corners = number_corners(local, lowest_first(faces.shared[turned], piece.ids))
         face = np.asarray(region.face[rows[turned]])
         return _Across(other, face, np.ones(len(face), np.bool_), parts.place_of(cell[turned]), corners)
 
@@ -387,7 +394,7 @@ class _PartWriter:
         outer = find_outer(piece)
         facets, cell = piece.facets[outer], faces.facet_cell + self._plan.region.cell_start[k]
         mine = self._plan.parts.part_of(cell) == numbers.number
-        owner, corners = self._plan.parts.place_of(cell), local[facets]
+        owner, corners = self._plan.parts.place_of(cell), number_corners(local, facets)
         face = np.full(len(owner), -1, np.int64)
         for row, of_patch in runs_of(keys, self._plan.patch_keys(piece)[outer]):
             in_piece = np.flatnonzero(mine[of_patch])
@@ -401,13 +408,13 @@ class _PartWriter:
             if self._places is not None:
                 first, _, start = self._whole
                 self._face_to.write(at, int(start[row]) + first[k][row] + 1 + in_piece)
-            patch, height = patch_of_key(int(keys[row]), self._plan.pieces.ground), piece.points[facets[chosen], 2]
-            name = patch.name
+            patch, faced = patch_of_key(int(keys[row]), self._plan.pieces.ground), facets[chosen]
+            name, height = patch.name, piece.points[fill_corners(faced), 2]
             self._lowest[name] = min(self._lowest.get(name, np.inf), float(height.min()))
             self._highest[name] = max(self._highest.get(name, -np.inf), float(height.max()))
             if patch.kind == "wall":
-                centres = piece.points[piece.cells[faces.facet_cell[chosen]]].mean(axis=1)
-                near = count_distances(centres, piece.points, facets[chosen])
+                centres = find_centres(piece.points, piece.cells[faces.facet_cell[chosen]])
+                near = count_distances(centres, piece.points, faced)
                 self._near[name] = self._near.get(name, 0) + near
         if self._zones is not None:
             self._zones.write(k, np.where(mine, self._plan.zone_keys(piece)[outer], -1), face)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.data.mesh import GROUND_PATCHES, Marker
 from pipeline.data.regions import Region
-from tiler.export.foam_files import foam_header
+from tiler.export.foam_files import POLY_MESH, foam_header
 from tiler.export.region_faces import FacetSets, Ints
 
-POLY_MESH = "constant/polyMesh"
 PATCHES = {
     Marker.GROUND: "ground",
     Marker.WALL: "walls",

@@ -22,6 +22,7 @@ from stitch.pieces.cell_faces import CellFaces, find_cell_faces
 from stitch.pieces.conformity import group_rows
 from tiler.export.pieces import Pieces
 from tiler.mesh_files.mesh_pieces import MeshPiece
+from tiler.mesh_files.transitions import NO_CORNER
 
 Ints = NDArray[np.int64]
 # Given a piece, the key of a set of facets, or of cells, for each of them; several sets may have one.
@@ -108,7 +109,7 @@ class OwnFaces:
     ----------
     owner, neighbour : int64, (n,)
         Cells by their numbers over the region, ascending pairs.
-    corners : int32, (n, 3)
+    corners : int32, (n, 3) or (n, 4)
         Vertices as rows of the piece's points, that of the lowest number over the region first; the normal points
         out of the owner.
     number : int64, (n,)
@@ -121,12 +122,15 @@ class OwnFaces:
     number: Ints
 
 
-@dataclass
-class _Waiting:
+@dataclass(frozen=True, eq=False)
+class Waiting:
     """Shared faces of pieces that came before: vertices and row of each."""
 
     corners: Ints
     row: Ints
+
+
+NOTHING = Waiting(np.empty((0, 0), np.int64), np.empty(0, np.int64))
 
 
 def survey_faces(
@@ -166,7 +170,7 @@ def survey_faces(
     n_cells, n_faces, n_shared = (np.zeros(n, np.int64) for _ in range(3))
     centre = np.empty((n, 2))
     counts: list[list[dict[int, int]]] = [[] for _ in kinds]
-    waiting = _Waiting(np.empty((0, 3), np.int64), np.empty(0, np.int64))
+    waiting = NOTHING
     paths = [folder / name for name in ("cells", "before", "mates")]
     with paths[0].open("wb") as cells_file, paths[1].open("wb") as before_file, paths[2].open("wb") as mates_file:
         for k in range(n):
@@ -182,7 +186,7 @@ def survey_faces(
             (faces.shared_cell + n_cells[:k].sum()).astype(np.int64).tofile(cells_file)
             np.searchsorted(faces.owner, faces.shared_cell, side="right").astype(np.int64).tofile(before_file)
             rows = n_shared[:k].sum() + np.arange(n_shared[k])
-            waiting, mates = _meet(waiting, piece.ids[faces.shared], rows, piece.name)
+            waiting, mates = meet(waiting, number_corners(piece.ids, faces.shared), rows, piece.name)
             mates.tofile(mates_file)
     if len(waiting.row):
         k = int(np.searchsorted(np.cumsum(n_shared), waiting.row[0], side="right"))
@@ -201,6 +205,8 @@ def faces_of_piece(piece: MeshPiece) -> CellFaces:
     InputError
         If its cells and facets do not fit together.
     """
+    if piece.faces is not None:
+        return piece.faces
     try:
         return find_cell_faces(piece.cells, piece.facets[find_outer(piece)], len(piece.points))
     except ValueError as error:
@@ -291,7 +297,9 @@ def wrong_ground(piece: MeshPiece) -> InputError:
 
 
 def lowest_first(corners: NDArray[np.int32], ids: Ints) -> NDArray[np.int32]:
-    """Turn each row (n, 3) so that the vertex with the lowest of `ids` stands first; the orientation stays.
+    """Turn each row so that the vertex with the lowest of `ids` stands first; the orientation stays.
+
+    Rows are (n, 3), or (n, 4) with `NO_CORNER` in the last place of triangles.
 
     Two pieces so begin a face with the same vertex, as OpenFOAM asks of both sides of a processor patch.
 
@@ -306,20 +314,29 @@ def lowest_first(corners: NDArray[np.int32], ids: Ints) -> NDArray[np.int32]:
 
 @kernel
 def _turn(corners, ids):  # type: ignore[no-untyped-def]  # pragma: no cover
-    turned = np.empty_like(corners)
+    turned = corners.copy()
     for i in range(len(corners)):
-        first = 0
-        for k in range(1, 3):
+        first, n = 0, corners.shape[1]
+        if corners[i, n - 1] < 0:
+            n -= 1
+        for k in range(1, n):
             if ids[corners[i, k]] < ids[corners[i, first]]:
                 first = k
-        for k in range(3):
-            turned[i, k] = corners[i, (first + k) % 3]
+        for k in range(n):
+            turned[i, k] = corners[i, (first + k) % n]
     return turned
 
 
-def _meet(waiting: _Waiting, corners: Ints, rows: Ints, name: str) -> tuple[_Waiting, Ints]:
+def number_corners(numbers: Ints, corners: NDArray[np.int32]) -> Ints:
+    """Give the numbers of the corners of faces; `NO_CORNER` stays."""
+    found: Ints = numbers[corners]
+    return found if corners.shape[1] == 3 else np.where(corners == NO_CORNER, NO_CORNER, found)
+
+
+def meet(waiting: Waiting, corners: Ints, rows: Ints, name: str) -> tuple[Waiting, Ints]:
     """Find which shared faces of a piece an earlier one has, as pairs (earlier, own) of rows (p, 2)."""
-    both = np.concatenate([waiting.corners, np.sort(corners, axis=1)])
+    own = np.sort(corners, axis=1)
+    both = np.concatenate([waiting.corners, own]) if len(waiting.row) else own
     row = np.concatenate([waiting.row, rows])
     group, n_groups = group_rows(both)
     count = np.bincount(group, minlength=n_groups)
@@ -328,7 +345,7 @@ def _meet(waiting: _Waiting, corners: Ints, rows: Ints, name: str) -> tuple[_Wai
     order = np.argsort(group, kind="stable")
     is_pair = count[group[order]] == 2
     left = np.sort(order[~is_pair])
-    return _Waiting(both[left], row[left]), row[order[is_pair]].reshape(-1, 2)
+    return Waiting(both[left], row[left]), row[order[is_pair]].reshape(-1, 2)
 
 
 def _number_faces(

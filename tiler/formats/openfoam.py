@@ -23,14 +23,13 @@ from tiler.export.foam_case import write_system
 from tiler.export.foam_files import LABEL_LIMIT
 from tiler.export.foam_part import DISTANCES, FoamPlan, PartCounts, PointPlaces, write_part
 from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_name, is_house, leaf_key
-from tiler.export.foam_prisms import write_foam_prisms
 from tiler.export.pedestrian_surface import write_pedestrian_surface
 from tiler.export.pieces import Pieces
+from tiler.export.prism_pieces import PrismPieces, open_prisms
 from tiler.export.region_faces import Ints, find_inner_ground, find_outer, survey_faces
 from tiler.export.wind_case import PEDESTRIAN, Domain, write_wind_cases
 from tiler.export.wind_profile import PEDESTRIAN_HEIGHT, Wind, WindWords, make_wind
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
-from tiler.mesh_files.prisms import read_prisms
 from tiler.mesh_files.run_files import RunFiles, RunSource, crs_of
 from tiler.store.atomic import replacing_folder
 
@@ -64,7 +63,7 @@ def export_openfoam(
     case : {"wind"}, optional
         Add the files of a simulation.
     cells : {"prism", "hybrid"}, optional
-        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms.read_prisms`, also for memory.
+        Write prisms instead of tetrahedra; see `tiler.export.prism_pieces.open_prisms`, also for memory.
     prism_layers : int, optional
         Of a hybrid mesh.
     **wind
@@ -105,13 +104,11 @@ def export_openfoam(
     if case is not None and pieces.files.parts != 1:
         raise _refuse_parts(case, pieces.files)
     with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".heights.") as name:
-        heights = None if case is None else Path(name)
-        if cells is not None:
-            prisms = read_prisms(pieces, cells, prism_layers, polyhedra=True)
-            kinds = {"by_building": buildings == "patches", "by_zone": buildings == "zones"}
-            counts = write_foam_prisms(folder, prisms, **kinds, heights=heights, parts=parts)
-        else:
-            counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings, heights=heights)
+        heights = None if case is None else Path(name, "heights")
+        if heights is not None:
+            heights.mkdir()
+        combined = pieces if cells is None else open_prisms(pieces, cells, prism_layers, Path(name))
+        counts = write_openfoam(folder, combined, parts=parts, buildings=buildings, heights=heights)
         notes = []
         if heights is None:
             write_system(folder, parts=parts)
@@ -254,10 +251,23 @@ def write_openfoam(
                 pieces, region, columns, scratch, n_parts=parts, kinds=kinds, volumes=(_by_volume, volumes)
             )
         n_faces = region.n_inner + int(patches.first(range(len(pieces.names)))[1].sum())
-        label = 32 if max(3 * n_faces, pieces.n_points, int(region.cell_start[-1])) <= LABEL_LIMIT else 64
+        polygons = isinstance(pieces, PrismPieces)
+        most = max((4 if polygons else 3) * n_faces, pieces.n_points, int(region.cell_start[-1]))
+        label = 32 if most <= LABEL_LIMIT else 64
         zoned = buildings == "zones" or len(zones.keys) > 0
         plan = FoamPlan(
-            pieces, region, patches, volumes, zoned, sets_of, zones_of, divided, label, heights, _by_volume
+            pieces,
+            region,
+            patches,
+            volumes,
+            zoned,
+            sets_of,
+            zones_of,
+            divided,
+            label,
+            heights,
+            _by_volume,
+            polygons,
         )
         if parts is None:
             return [write_part(folder, plan, 0, None)]

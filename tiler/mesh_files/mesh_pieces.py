@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import GROUND_PATCHES, Marker
 from pipeline.data.regions import Region, Regions
+from stitch.pieces.cell_faces import CellFaces
 from stitch.pieces.numbering import Numbering
 from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource, find_files
@@ -51,6 +52,9 @@ class MeshPiece:
         Leaf area density of each cell (m2/m3), 0 in open air; None in a run without trees.
     regions : tuple of Region
         What cells of the whole mesh are filled with.
+    faces : CellFaces, or None
+        Faces of cells that are no tetrahedra (`tiler.export.prism_pieces`): then rows of `cells` have six places,
+        those of faces and `facets` four, with `tiler.mesh_files.transitions.NO_CORNER` in those that are left.
     """
 
     name: str
@@ -63,6 +67,7 @@ class MeshPiece:
     region: NDArray[np.int8] | None = None
     leaves: NDArray[np.float32] | None = None
     regions: Regions = (Region.AIR,)
+    faces: CellFaces | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ tetrahedra elsewhere (`tiler.mesh_files.transitions`).
 """
 
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from pipeline.data.regions import Region
 from stitch.pieces.conformity import group_rows
 from stitch.pieces.face_mates import FACES
 from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces
-from tiler.mesh_files.transitions import NO_CORNER, SIDES, find_cut_sides, halve_sides, split_prisms
+from tiler.mesh_files.transitions import NO_CORNER, SIDES, Rows, find_cut_sides, split_prisms
 
 Ints = NDArray[np.int64]
 Number = TypeVar("Number", bound=np.generic)
@@ -99,16 +99,6 @@ class PrismMesh:
         kinds = ((n, np.flatnonzero(self.widths == n)) for n in sorted(FACES_OF, reverse=True))
         return [(n, rows) for n, rows in kinds if len(rows)]
 
-    def centres(self, cells: Ints | None = None) -> NDArray[np.float64]:
-        """Give the mean of the corners of some cells, or of all, float64 (k, 3) (m)."""
-        corners = self.cells if cells is None else self.cells[cells]
-        width = (corners != NO_CORNER).sum(axis=1)
-        centres = np.empty((len(corners), 3))
-        for n in FACES_OF:
-            rows = np.flatnonzero(width == n)
-            centres[rows] = self.points[corners[rows, :n]].mean(axis=1)
-        return centres
-
     def facets(self, width: int) -> tuple[Ints, NDArray[np.int32], Ints]:
         """Give the triangles (3) or quadrilaterals (4) of the boundary: corners, marker and building of each.
 
@@ -126,9 +116,28 @@ class PrismMesh:
         )
 
 
-def read_prisms(
-    pieces: MeshPieces, kind: str = "prism", layers: int | None = None, *, polyhedra: bool = False
-) -> PrismMesh:
+def find_centres(points: NDArray[np.float64], cells: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    """Give the mean of the corners of cells, (k, 4) or as of `PrismMesh`: float64 (k, d), of points (n, d)."""
+    width = (cells != NO_CORNER).sum(axis=1)
+    centres = np.empty((len(cells), points.shape[1]))
+    for n in FACES_OF:
+        rows = np.flatnonzero(width == n)
+        centres[rows] = points[cells[rows, :n]].mean(axis=1)
+    return centres
+
+
+def check_cells(pieces: MeshPieces, kind: str, layers: int | None) -> int:
+    """Check what cells are asked for, as of `read_prisms`; gives the number of layers."""
+    if layers is not None and (kind != "hybrid" or layers < 1):
+        raise ConfigError(f"--prism-layers {layers}: is for --cells hybrid, and 1 or more")
+    if len(pieces.files.regions) > 1 and kind == "prism":
+        what = "in buildings" if Region.BUILDING in pieces.files.regions else "in soil"
+        option = "--solids" if Region.BUILDING in pieces.files.regions else "--underground"
+        raise ConfigError(f"--cells {kind}: not with cells {what}; take --cells hybrid, or mesh without {option}")
+    return LAYERS if layers is None else layers
+
+
+def read_prisms(pieces: MeshPieces, kind: str = "prism", layers: int | None = None) -> PrismMesh:
     """Read the mesh of a run as prisms; soil and buildings stay tetrahedra.
 
     Parameters
@@ -140,9 +149,6 @@ def read_prisms(
     layers : int, optional
         Of a hybrid mesh, how many prisms at most stand over each triangle of the ground and roofs; `LAYERS` by
         default.
-    polyhedra : bool
-        Whether prisms beside tetrahedra have two triangles for a side, instead of being cut into pyramids and
-        tetrahedra: for programs that take cells of any faces.
 
     Raises
     ------
@@ -156,12 +162,7 @@ def read_prisms(
     -----
     Memory is some 700 bytes for each prism.
     """
-    if layers is not None and (kind != "hybrid" or layers < 1):
-        raise ConfigError(f"--prism-layers {layers}: is for --cells hybrid, and 1 or more")
-    if len(pieces.files.regions) > 1 and kind == "prism":
-        what = "in buildings" if Region.BUILDING in pieces.files.regions else "in soil"
-        option = "--solids" if Region.BUILDING in pieces.files.regions else "--underground"
-        raise ConfigError(f"--cells {kind}: not with cells {what}; take --cells hybrid, or mesh without {option}")
+    layers = check_cells(pieces, kind, layers)
     points = np.empty((pieces.n_points, 3))
     cells, turned, facets, marker, building = [], [], [], [], []
     leaves: list[NDArray[np.float32]] = []
@@ -169,13 +170,13 @@ def read_prisms(
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
         points[piece.ids] = piece.points
-        rows, first, second_turned = _prisms_of(piece) if kind == "prism" else _hybrid_of(piece, layers or LAYERS)
+        rows, first, second_turned = combine_piece(piece, kind, layers)
         cells.append(np.where(rows == NO_CORNER, NO_CORNER, piece.ids[rows]))
         turned.append(second_turned)
         facets.append(piece.ids[piece.facets])
         marker.append(piece.marker)
         building.append(piece.building)
-        leaves += [] if piece.leaves is None else [piece.leaves[first + (rows[:, 4] != NO_CORNER)]]
+        leaves += [] if piece.leaves is None else [leaves_of(piece.leaves, rows, first)]
         regions += [] if piece.region is None else [piece.region[first]]
     tile = np.repeat(np.arange(len(cells), dtype=np.int32), [len(part) for part in cells])
     prisms, triangles = np.concatenate(cells), np.concatenate(facets)
@@ -187,19 +188,16 @@ def read_prisms(
     if kind == "hybrid":
         second = np.concatenate(turned)
         cut = find_cut_sides(prisms, second, triangles, np.column_stack((marks, houses)))
-    if kind == "hybrid" and not polyhedra:
         prisms, parent, middle = split_prisms(prisms, second, cut, len(points))
         points = np.concatenate((points, points[middle].mean(axis=1)))
         tile, density = tile[parent], None if density is None else density[parent]
         region = None if region is None else region[parent]
-    listed = list_faces(prisms)
-    if kind == "hybrid" and polyhedra:
-        listed = halve_sides(*listed, prisms, second, cut)
-    faces = _pair_faces(*listed)
-    row = _find_facets(faces[3], triangles)
-    if (np.append(marks, 0)[row] != marks[row[:, :1]]).any():
-        raise InputError(f"{pieces.files.directory}: halves of a face have different markers; run again")
-    first_half = row[:, 0]
+    faces = pair_faces(*list_faces(prisms))
+    first_half = find_facets(faces[3], triangles, marks)
+    if (first_half < 0).any():
+        raise InputError(
+            f"{len(triangles)} facets do not cover the {len(faces[3])} faces of the boundary; run again"
+        )
     found = marks[first_half], houses[first_half]
     mesh = PrismMesh(points, prisms, tile, *faces, *found, pieces.ground, density, region)
     return replace(mesh, between=between[0], between_marker=between[1], between_building=between[2])
@@ -249,6 +247,27 @@ def combine_cells(cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[
 
 
 Combined = tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.bool_]]
+
+
+def combine_piece(piece: MeshPiece, kind: str, layers: int) -> Combined:
+    """Give the cells of a piece, rows of its points as of `PrismMesh`.
+
+    Returns
+    -------
+    int32, (m, 6)
+        The cells.
+    int64, (m,)
+        The first tetrahedron of each.
+    bool, (m,)
+        Of prisms, whether the third column rises second.
+    """
+    return _prisms_of(piece) if kind == "prism" else _hybrid_of(piece, layers)
+
+
+def leaves_of(density: NDArray[np.float32], cells: NDArray[np.int32], first: Ints) -> NDArray[np.float32]:
+    """Give the leaf area density of cells of `combine_piece`: of a prism that of its middle tetrahedron."""
+    found: NDArray[np.float32] = density[first + (cells[:, 4] != NO_CORNER)]
+    return found
 
 
 def _prisms_of(piece: MeshPiece) -> Combined:
@@ -302,7 +321,7 @@ def _hybrid_of(piece: MeshPiece, layers: int) -> Combined:
     return rows[order], begin[order], turned[order]
 
 
-def _pair_faces(faces: Ints, cell: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+def pair_faces(faces: NDArray[Number], cell: Ints) -> tuple[NDArray[Number], Ints, Ints, NDArray[Number], Ints]:
     """Find the faces between two cells and those of one, as `PrismMesh` has them."""
     group, n = group_rows(np.sort(faces, axis=1))
     order = np.argsort(group, kind="stable")
@@ -318,7 +337,7 @@ def _pair_faces(faces: Ints, cell: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
     return faces[low[pair]][sequence], owner[sequence], neighbour[sequence], faces[outer], cell[outer]
 
 
-def list_faces(cells: Ints) -> tuple[Ints, Ints]:
+def list_faces(cells: NDArray[Number]) -> tuple[NDArray[Number], Ints]:
     """List the faces of cells, (k, 4) as in `PrismMesh.outer`, and the cell of each, ascending."""
     width = (cells != NO_CORNER).sum(axis=1)
     padded = np.column_stack((cells, np.full(len(cells), NO_CORNER)))
@@ -332,8 +351,26 @@ def list_faces(cells: Ints) -> tuple[Ints, Ints]:
     return np.concatenate(faces)[order], cell[order]
 
 
-def _find_facets(outer: Ints, facets: Ints) -> Ints:
-    """Rows of the facets (triangles) that each face of the boundary is made of: int64 (f, 2), one twice or two."""
+def find_facets(outer: Rows, facets: Rows, marker: NDArray[np.int32]) -> Ints:
+    """Find the facets, triangles, that faces of one cell are made of.
+
+    Parameters
+    ----------
+    outer : int32 or int64, (f, 4)
+        The faces.
+    facets, marker : int64 (k, 3) and int32 (k,)
+        Facets of the boundary; both halves of a face must have one marker.
+
+    Returns
+    -------
+    int64, (f,)
+        Row of the first facet of each, -1 for a face that is none.
+
+    Raises
+    ------
+    InputError
+        If a facet is no face, or half of one.
+    """
     quad = outer[:, 3] != NO_CORNER
     rows = np.concatenate((np.flatnonzero(~quad), np.repeat(np.flatnonzero(quad), 4)))
     halves = np.stack([np.delete(outer[quad], k, axis=1) for k in range(4)], axis=1).reshape(-1, 3)
@@ -347,6 +384,7 @@ def _find_facets(outer: Ints, facets: Ints) -> Ints:
     pairs = np.full((len(outer), 2), -1)
     pairs[rows[has][::-1], 0] = found[has][::-1]
     pairs[rows[has], 1] = found[has]
-    if (pairs < 0).any() or has.sum() != len(facets):
-        raise InputError(f"{len(facets)} facets do not cover the {len(outer)} faces of the boundary; run again")
-    return pairs
+    if has.sum() != len(facets) or (marker[pairs[:, 0]] != marker[pairs[:, 1]]).any():
+        raise InputError(f"{len(facets)} facets are not the faces of cells, both halves of one marker; run again")
+    first: Ints = pairs[:, 0]
+    return first

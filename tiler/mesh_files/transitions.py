@@ -6,12 +6,16 @@ the triangles beyond. A prism with such sides becomes pyramids on the sides that
 cells where two diagonals meet in a corner, else around its middle.
 """
 
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from stitch.pieces.conformity import group_rows
 
 Ints = NDArray[np.int64]
+Rows = NDArray[np.integer[Any]]
+Number = TypeVar("Number", bound=np.generic)
 NO_CORNER = -1  # in the places of cells and faces with fewer corners
 # Sides of a prism by its corners, counter-clockwise seen from outside, and their halves: of the three columns the
 # first rises first, then the second or, turned, the third.
@@ -26,7 +30,7 @@ ENDS = ((0, 2, 1), (3, 4, 5))
 MIDDLE, NONE = 6, 7  # places behind the six corners: the prism's middle, and none
 
 
-def find_cut_sides(cells: Ints, turned: NDArray[np.bool_], facets: Ints, label: Ints) -> NDArray[np.bool_]:
+def find_cut_sides(cells: Rows, turned: NDArray[np.bool_], facets: Rows, label: Ints) -> NDArray[np.bool_]:
     """Find the sides of prisms that must be cut.
 
     Parameters
@@ -61,8 +65,8 @@ def find_cut_sides(cells: Ints, turned: NDArray[np.bool_], facets: Ints, label: 
 
 
 def halve_sides(
-    faces: Ints, cell: Ints, cells: Ints, turned: NDArray[np.bool_], cut: NDArray[np.bool_]
-) -> tuple[Ints, Ints]:
+    faces: NDArray[Number], cell: Ints, cells: NDArray[Number], turned: NDArray[np.bool_], cut: NDArray[np.bool_]
+) -> tuple[NDArray[Number], Ints]:
     """Put two triangles in the place of each side that must be cut.
 
     Parameters
@@ -76,7 +80,7 @@ def halve_sides(
     """
     of, side = np.nonzero(cut)
     quad = np.searchsorted(cell, of) + len(ENDS) + side
-    halves = np.full((len(of), 2, 4), NO_CORNER)
+    halves = np.full((len(of), 2, 4), NO_CORNER, cells.dtype)
     halves[:, :, :3] = _halves(cells, turned, of, side)
     kept = np.delete(np.arange(len(faces)), quad)
     place = np.concatenate((kept, np.repeat(quad, 2)))
@@ -84,7 +88,50 @@ def halve_sides(
     return np.concatenate((faces[kept], halves.reshape(-1, 4)))[order], cell[place[order]]
 
 
-def _halves(cells: Ints, turned: NDArray[np.bool_], of: Ints, side: Ints) -> Ints:
+def turn_over(faces: NDArray[Number]) -> NDArray[Number]:
+    """Turn faces, (k, 3) or (k, 4), to look the other way; the first corner stays.
+
+    Examples
+    --------
+    >>> turn_over(np.array([[5, 6, 7, 8], [5, 6, 7, NO_CORNER]])).tolist()
+    [[5, 8, 7, 6], [5, 7, 6, -1]]
+    """
+    triangles = faces[:, [0, 2, 1, *range(3, faces.shape[1])]]
+    return (
+        triangles
+        if faces.shape[1] == 3
+        else np.where(faces[:, 3:] == NO_CORNER, triangles, faces[:, [0, 3, 2, 1]])
+    )
+
+
+def fill_corners(rows: NDArray[Number]) -> NDArray[Number]:
+    """Repeat the first corner of cells or faces (k, w) in the places that have none."""
+    return np.where(rows == NO_CORNER, rows[:, :1], rows)
+
+
+def find_seam_sides(
+    cells: NDArray[Number], turned: NDArray[np.bool_], cut: NDArray[np.bool_], shared: Rows
+) -> tuple[Ints, NDArray[Number]]:
+    """Find which of the sides to be cut may be whole in another piece: both halves are among its faces, (s, 3).
+
+    Returns
+    -------
+    int64, (k,)
+        The sides, as places in `cut` laid flat.
+    int64, (k, 4)
+        Their corners.
+    """
+    of, side = np.nonzero(cut)
+    halves = _halves(cells, turned, of, side).reshape(-1, 3)
+    group, n = group_rows(np.sort(np.concatenate((shared, halves)), axis=1))
+    known = np.zeros(n, np.bool_)
+    known[group[: len(shared)]] = True
+    both = known[group[len(shared) :]].reshape(-1, 2).all(axis=1)
+    of, side = of[both], side[both]
+    return 3 * of + side, np.take_along_axis(cells[of], SIDES[side], axis=1)
+
+
+def _halves(cells: NDArray[Number], turned: NDArray[np.bool_], of: Ints, side: Ints) -> NDArray[Number]:
     """Give the two triangles, (k, 2, 3), of sides of cells."""
     corners = HALVES[turned[of].astype(np.int64), side].reshape(-1, 6)
     return np.take_along_axis(cells[of], corners, axis=1).reshape(-1, 2, 3)
