@@ -3,6 +3,7 @@
 Cells become their faces, so prisms, pyramids, tetrahedra and OpenFOAM's polyhedra are one thing.
 """
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,10 @@ from pipeline.data.errors import ConfigError, InputError
 from stitch.pieces import conformity
 from tiler.check.check import CheckReport
 from tiler.check.proofs import RELATIVE_TOLERANCE, SIDE_TOLERANCE, Fault, Proof, Vertices, find_faults
+from tiler.export.export import EXPORT_RECORD
 from tiler.export.foam_files import POLY_MESH, read_foam_faces, read_foam_list
 from tiler.export.region_faces import find_outer
+from tiler.mesh_files.air import open_air
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import list_faces
 from tiler.mesh_files.transitions import NO_CORNER, turn_over
@@ -67,6 +70,8 @@ def check_export(directory: Path, path: Path) -> CheckReport:
     """
     mesh = _read(path)
     pieces = open_pieces(directory)
+    if (record := path / EXPORT_RECORD).is_file() and "regions" in json.loads(record.read_text()):
+        pieces = open_air(pieces)
     n = pieces.n_points
     own, facets, volume = np.full((n, 3), np.nan), [], 0.0
     for k in range(len(pieces.names)):

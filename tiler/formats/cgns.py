@@ -16,30 +16,30 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.errors import ConfigError
 from tiler.export.export import CELLS as CELL_KINDS
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces, blocks_of
+from tiler.export.region_faces import find_outer
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
-from tiler.store.run_folder import LEAVES
+from tiler.store.run_folder import LEAVES, REGION
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
 # CGNS's types of elements by corners: TRI_3 and QUAD_4, TETRA_4, PYRA_5 and PENTA_6.
 FACETS = {3: 5, 4: 7}
 SOLIDS = {4: 10, 5: 12, 6: 14}
 QUADRILATERALS = "_quadrilaterals"  # behind the name of a patch, in that of their section
-BASE, ZONE, CELLS = "city", "air", "cells"
+BASE, AIR, REGIONS, CELLS = "city", "air", "regions", "cells"  # the base; the zone, of air alone or of several
 OTHERS = {4: "tetrahedra", 5: "pyramids"}  # sections of cells behind that of prisms
 Ints = NDArray[np.int64]
 INT32_LIMIT = 2**31 - 1
 NAME_BYTES, TYPE_BYTES = 33, 3  # of attributes and the strings at the root, their last byte zero
 UNITS = ("Null", "Meter", "Null", "Null", "Null")  # mass, length, time, temperature, angle: 32 characters each
 LENGTH = (0, 1, 0, 0, 0)  # its exponents in these
-LEAF_DATA = f"Leaves/{LEAVES}/ data"
+FIELDS = {LEAVES: ("Leaves", "f4"), REGION: ("Regions", "i4")}  # of cells: the solution of each, and its type
 TYPES = {"i4": "I4", "i8": "I8", "f4": "R4", "f8": "R8", "i1": "C1"}
 
 
@@ -51,7 +51,8 @@ class _Survey:
     cells: dict[int, int]  # by corners
     facets: dict[int, dict[int, int]]
     ground: tuple[str, ...]  # names of its patches
-    leaves: bool  # whether cells have a leaf area density
+    fields: tuple[str, ...]  # what cells tell, of `FIELDS`
+    inside: frozenset[int]  # patches with cells on both sides
 
     @property
     def n_cells(self) -> int:
@@ -97,8 +98,6 @@ def export_cgns(
 
     Raises
     ------
-    ConfigError
-        If the mesh has soil, or cells in buildings.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -111,7 +110,6 @@ def export_cgns(
     with replacing(output) as part, disk_errors(output):
         if cells is not None:
             mesh = read_prisms(pieces, cells, prism_layers)
-            _refuse_regions(mesh.region)
             _write_prisms(part, mesh, crs, by_building=buildings is not None)
         else:
             write_cgns(part, pieces, crs=crs, buildings=buildings)
@@ -127,8 +125,15 @@ def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -
             facets.setdefault(key, {})[width] = corners[rows]
     counts = {key: {width: len(rows) for width, rows in facets[key].items()} for key in sorted(facets)}
     kinds = mesh.by_width()
+    fields = {LEAVES: mesh.leaves, REGION: mesh.region}
+    inside = patch_keys(mesh.between_marker, mesh.between_building, by_building=by_building)
     survey = _Survey(
-        len(mesh.points), {width: len(rows) for width, rows in kinds}, counts, mesh.ground, mesh.leaves is not None
+        len(mesh.points),
+        {width: len(rows) for width, rows in kinds},
+        counts,
+        mesh.ground,
+        tuple(name for name, values in fields.items() if values is not None),
+        frozenset(inside.tolist()),
     )
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
         zone = _write_tree(file, survey, crs)
@@ -137,8 +142,9 @@ def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -
         for width, rows in kinds:
             data = zone[f"{survey.sections[width]}/ElementConnectivity/ data"]
             data[:] = mesh.cells[rows, :width].ravel() + 1
-        if mesh.leaves is not None:
-            zone[LEAF_DATA][:] = mesh.leaves[np.concatenate([rows for _, rows in kinds])]
+        for name, values in fields.items():
+            if values is not None:
+                zone[_data_of(name)][:] = values[np.concatenate([rows for _, rows in kinds])]
         for key, parts in facets.items():
             for width, rows in parts.items():
                 zone[f"{_section(patch_of_key(key, mesh.ground), width)}/ElementConnectivity/ data"][:] = (
@@ -178,9 +184,10 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
                     data[start : start + len(rows)] = piece.points[rows, axis]
             found = patch_keys(piece.marker, piece.building, by_building=buildings is not None)
             patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
-            if piece.leaves is not None:
-                first = seen[0] // piece.cells.shape[1]
-                zone[LEAF_DATA][first : first + len(piece.cells)] = piece.leaves
+            first = seen[0] // piece.cells.shape[1]
+            for name in survey.fields:
+                values = piece.leaves if name == LEAVES else piece.region
+                zone[_data_of(name)][first : first + len(piece.cells)] = values
             for key, corners in [(0, piece.cells), *patches]:
                 nodes = piece.ids[corners].ravel() + 1
                 # Not kept open: each open data set that was written has a buffer of 64 kB.
@@ -189,28 +196,25 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
 
 
 def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
-    n_cells, facets, leaves = 0, dict[int, int](), False
+    n_cells, facets, inside = 0, dict[int, int](), set[int]()
+    fields: tuple[str, ...] = ()
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
-        _refuse_regions(piece.region)
-        leaves = piece.leaves is not None
+        found = {LEAVES: piece.leaves, REGION: piece.region}
+        fields = tuple(name for name, values in found.items() if values is not None)
         n_cells += len(piece.cells)
-        keys, counts = np.unique(
-            patch_keys(piece.marker, piece.building, by_building=by_building), return_counts=True
-        )
+        of_facet = patch_keys(piece.marker, piece.building, by_building=by_building)
+        inside.update(of_facet[~find_outer(piece)].tolist())
+        keys, counts = np.unique(of_facet, return_counts=True)
         for key, n in zip(keys.tolist(), counts.tolist(), strict=True):
             facets[key] = facets.get(key, 0) + n
-    return _Survey(
-        pieces.n_points, {4: n_cells}, {key: {3: n} for key, n in sorted(facets.items())}, pieces.ground, leaves
-    )
+    by_key = {key: {3: n} for key, n in sorted(facets.items())}
+    return _Survey(pieces.n_points, {4: n_cells}, by_key, pieces.ground, fields, frozenset(inside))
 
 
-def _refuse_regions(region: NDArray[np.int8] | None) -> None:
-    if region is not None and region.any():
-        raise ConfigError(
-            "cgns: the mesh has soil or cells in buildings, and the file holds one zone, of air; use "
-            "openfoam, msh or xdmf"
-        )
+def _data_of(name: str) -> str:
+    """Say where the numbers of a field of cells stand in the zone."""
+    return f"{FIELDS[name][0]}/{name}/ data"
 
 
 def _section(patch: Patch, width: int) -> str:
@@ -231,10 +235,11 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
     _node(base, "DimensionalUnits", "DimensionalUnits_t", units)
     _node(base, "CRS", "Descriptor_t", crs)
     patches = {key: patch_of_key(key, survey.ground) for key in survey.facets}
-    for patch in patches.values():
-        _write_family(base, patch)
+    for key, patch in patches.items():
+        if key not in survey.inside:
+            _write_family(base, patch)
     size = np.array([[survey.n_points], [survey.n_cells], [0]], f"<{kind}")
-    zone = _node(base, ZONE, "Zone_t", size)
+    zone = _node(base, REGIONS if REGION in survey.fields else AIR, "Zone_t", size)
     _node(zone, "ZoneType", "ZoneType_t", "Unstructured")
     grid = _node(zone, "GridCoordinates", "GridCoordinates_t")
     for axis in "XYZ":
@@ -244,17 +249,22 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
     for width, n in survey.cells.items():
         _write_section(zone, survey.sections[width], (SOLIDS[width], width), first, n, kind)
         first += n
-    if survey.leaves:
-        solution = _node(zone, "Leaves", "FlowSolution_t")
+    for name in survey.fields:
+        solution = _node(zone, FIELDS[name][0], "FlowSolution_t")
         _node(solution, "GridLocation", "GridLocation_t", "CellCenter")
-        density = _array(solution, LEAVES, survey.n_cells, "f4")
-        _node(density, "DimensionalExponents", "DimensionalExponents_t", np.array(-np.array(LENGTH), "<f4"))
+        values = _array(solution, name, survey.n_cells, FIELDS[name][1])
+        if name == LEAVES:
+            _node(values, "DimensionalExponents", "DimensionalExponents_t", np.array(-np.array(LENGTH), "<f4"))
+        else:
+            _node(values, "DataClass", "DataClass_t", "DimensionlessConstant")
     conditions = _node(zone, "ZoneBC", "ZoneBC_t") if patches else None
     for key, patch in patches.items():
         begin = first
         for width, n in survey.facets[key].items():
             _write_section(zone, _section(patch, width), (FACETS[width], width), first, n, kind)
             first += n
+        if key in survey.inside:
+            continue
         condition = _node(conditions, patch.name, "BC_t", "FamilySpecified")
         _node(condition, "PointRange", "IndexRange_t", np.array([[begin], [first - 1]], f"<{kind}"))
         _node(condition, "GridLocation", "GridLocation_t", "FaceCenter")

@@ -29,6 +29,7 @@ from tiler.export.prism_pieces import PrismPieces, open_prisms
 from tiler.export.region_faces import Ints, find_inner_ground, find_outer, survey_faces
 from tiler.export.wind_case import PEDESTRIAN, Domain, write_wind_cases
 from tiler.export.wind_profile import PEDESTRIAN_HEIGHT, Wind, WindWords, make_wind
+from tiler.mesh_files.air import open_air
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.run_files import RunFiles, RunSource, crs_of
 from tiler.store.atomic import replacing_folder
@@ -36,6 +37,7 @@ from tiler.store.atomic import replacing_folder
 # Roughness lengths between rough ground and the centres of its cells. Over bare ground the profile stays within
 # 2 % at 3 of them, and is 19 % off at 0.6: docs/wind.md.
 LEAST_DISTANCE = 2.5
+REGION_WORDS = {Region.SOIL: "cells in soil", Region.BUILDING: "cells in buildings"}
 WIND_OPTIONS = ("direction", "wind_speed", "wind_height", "wind_table", "roughness", "patch_roughness")
 
 
@@ -61,7 +63,7 @@ def export_openfoam(
     parts, buildings
         See `write_openfoam`.
     case : {"wind"}, optional
-        Add the files of a simulation.
+        Add the files of a simulation. The mesh is then that of the air alone.
     cells : {"prism", "hybrid"}, optional
         Write prisms instead of tetrahedra; see `tiler.export.prism_pieces.open_prisms`, also for memory.
     prism_layers : int, optional
@@ -77,9 +79,8 @@ def export_openfoam(
     Raises
     ------
     ConfigError
-        If there are too few columns for so many parts, no side for the
-        wind to come from, soil or cells in buildings where it should blow, or a mesh of several parts that share
-        no face.
+        If there are too few columns for so many parts, no side for the wind to come from, or a mesh of several
+        parts that share no face.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -88,28 +89,24 @@ def export_openfoam(
     if case is None and wind:
         raise ConfigError(f"--{min(wind).replace('_', '-')}: is for --case wind; give that too")
     blowing = make_wind(wind)
+    notes: list[str] = []
     pieces = open_pieces(source)
-    solids = Region.BUILDING in pieces.files.regions
-    if case is not None and pieces.files.depth:
+    if case is None and buildings is not None and Region.BUILDING in pieces.files.regions:
         raise ConfigError(
-            f"--case {case}: the mesh has soil to {pieces.files.depth:g} m below ground, where no wind blows; "
-            "leave --case out, or mesh without --underground"
-        )
-    if solids and (case is not None or buildings is not None):
-        option = f"--buildings {buildings}" if case is None else f"--case {case}"
-        raise ConfigError(
-            f"{option}: buildings of this mesh have cells, so walls and roofs are no patches; leave it out, or "
-            "mesh without --solids"
+            f"--buildings {buildings}: buildings of this mesh have cells, so walls and roofs are no patches; "
+            "leave it out, add --case wind, which is of the air alone, or mesh without --solids"
         )
     if case is not None and pieces.files.parts != 1:
         raise _refuse_parts(case, pieces.files)
+    if case is not None and len(pieces.files.regions) > 1:
+        others = " and ".join(REGION_WORDS[region] for region in pieces.files.regions if region != Region.AIR)
+        pieces, notes = open_air(pieces), [f"the case is of the air alone: {others} stay out"]
     with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".heights.") as name:
         heights = None if case is None else Path(name, "heights")
         if heights is not None:
             heights.mkdir()
         combined = pieces if cells is None else open_prisms(pieces, cells, prism_layers, Path(name))
         counts = write_openfoam(folder, combined, parts=parts, buildings=buildings, heights=heights)
-        notes = []
         if heights is None:
             write_system(folder, parts=parts)
         else:
@@ -118,7 +115,7 @@ def export_openfoam(
             domain = _describe_domain(counts, heights)
             own = {name: z0 for name, z0 in pieces.files.ground if z0 is not None and domain.patches.get(name)}
             blowing = replace(blowing, patches={**own, **blowing.patches})
-            notes = write_wind_cases(folder, domain, blowing, parts=parts)
+            notes += write_wind_cases(folder, domain, blowing, parts=parts)
             notes += _tell_near_walls(counts, blowing)
         # ParaView opens a case by an empty file.
         (folder / "case.foam").touch()
@@ -127,7 +124,7 @@ def export_openfoam(
             record["origin"] = pieces.files.origin
         if case is not None:
             crs = crs_of(pieces.files)
-            record |= {"crs": crs, "wind": asdict(blowing), "notes": notes}
+            record |= {"crs": crs, "wind": asdict(blowing), "notes": notes, "regions": ["air"]}
         (folder / EXPORT_RECORD).write_text(json.dumps(record, indent=1) + "\n")
     return notes
 

@@ -14,7 +14,7 @@ import pytest
 import pyvista
 from numpy.typing import NDArray
 
-from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
 from pipeline.data.regions import Region
 from stitch.pieces.conformity import compute_cell_volumes
@@ -29,7 +29,6 @@ from tests.tiler.export.conftest import Exported
 from tests.tiler.export.test_formats_msh import check_with_gmsh
 from tests.tiler.export.test_formats_openfoam import MESH, assert_in_order, volumes_of
 from tiler.check.export_proofs import check_export
-from tiler.cli.main import main
 from tiler.export.export import export_run, list_formats
 from tiler.export.foam_files import read_foam_faces
 from tiler.export.foam_patches import PATCHES
@@ -173,19 +172,32 @@ def test_parts_have_their_share_of_the_zones(soil_run: Path, tmp_path: Path) -> 
     assert len(zones[0]) == counts_of(soil_run)["building parts"] + 1
 
 
-def test_wind_does_not_blow_through_soil(
-    soil_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["export", str(soil_run), "--format", "openfoam", "--case", "wind", "-o", str(tmp_path / "case")]
-    assert main(words) == 2
-    assert "--case wind: the mesh has soil to 20 m below ground" in capsys.readouterr().err
-    assert not (tmp_path / "case").exists()
+def test_the_wind_case_is_of_the_air_alone(soil_run: Path, exported: Exported) -> None:
+    case = exported(soil_run, "openfoam", "--case", "wind", "--cells", "hybrid", "--parts", "2")
+    report = check_export(soil_run, case)
+    assert report.ok
+    assert report.facts["volume"] == pytest.approx(region_volumes(parts_of(soil_run))["air"])
+    record = json.loads((case / "export.json").read_text())
+    assert record["notes"][0] == "the case is of the air alone: cells in soil stay out"
+    patches = record["meshes"][0]["patches"]
+    assert patches["ground"]
+    assert not {"bottom", "foundations"} & set(patches)
 
 
-def test_cgns_refuses_soil(soil_run: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="the mesh has soil"):
-        export_run(soil_run, tmp_path / "city.cgns", name="cgns")
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("words", [(), ("--cells", "hybrid")])
+def test_cgns_tells_the_region_of_cells(soil_run: Path, exported: Exported, words: tuple[str, ...]) -> None:
+    with h5py.File(exported(soil_run, "cgns", *words)) as file:
+        zone = file["city/regions"]
+        region = zone["Regions/region/ data"][:]
+        corners = zone[f"{'tetrahedra' if words else 'cells'}/ElementConnectivity/ data"][:].reshape(-1, 4) - 1
+        points = np.stack([zone[f"GridCoordinates/Coordinate{axis}/ data"][:] for axis in "XYZ"], axis=1)
+        conditions = set(zone["ZoneBC"])
+        assert "ground" in zone
+    volume = compute_cell_volumes(points, corners.astype(np.int32))[0]
+    soil = volume[region[-len(corners) :] == Region.SOIL].sum()  # soil is tetrahedra, which stand last
+    assert soil == pytest.approx(region_volumes(parts_of(soil_run))["soil"])
+    assert "bottom" in conditions
+    assert "ground" not in conditions
 
 
 def test_ground_that_is_not_between_the_regions_is_refused(soil_run: Path, tmp_path: Path) -> None:
