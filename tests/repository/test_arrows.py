@@ -73,7 +73,7 @@ ORDER = {
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "landcover", "planning",
         "dashboard", "executors", "jobs", "pictures", "report", "workflow", "editing", "export", "tiles3d",
-        "serving", "wind", "check", "formats", "convert", "towns", "generalisation", "textures", "detail",
+        "serving", "wind", "formats", "check", "convert", "towns", "generalisation", "textures", "detail",
         "interface", "cli",
     ],
     "pipeline": [

@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import meshio
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +18,8 @@ from tiler.check.proofs import RELATIVE_TOLERANCE, SIDE_TOLERANCE, Fault, Proof,
 from tiler.export.export import EXPORT_RECORD
 from tiler.export.foam_files import POLY_MESH, read_foam_faces, read_foam_list
 from tiler.export.region_faces import find_outer
+from tiler.formats.cgns import read_cgns
+from tiler.formats.xdmf import read_xdmf
 from tiler.mesh_files.air import open_air
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import list_faces
@@ -25,6 +28,7 @@ from tiler.mesh_files.transitions import NO_CORNER, turn_over
 Ints = NDArray[np.int64]
 SHAPES = {"prisms": 53, "pyramids": 51, "tetrahedra": 40}  # faces, and those of four corners
 MIRRORED = [0, 2, 1, 3, 5, 4]
+Cells = tuple[NDArray[np.float64], list[tuple[int, Ints]]]  # points, and corners of cells with so many
 WIDTHS = {"wedge": 6, "pyramid": 5, "tetra": 4}
 
 
@@ -55,7 +59,7 @@ def check_export(directory: Path, path: Path) -> CheckReport:
     directory : Path
         Folder of the run.
     path : Path
-        A VTU or MSH file, or a case folder of OpenFOAM, whole or decomposed.
+        A VTU, MSH, XDMF or CGNS file, or a case folder of OpenFOAM, whole or decomposed.
 
     Raises
     ------
@@ -99,23 +103,28 @@ def _read(path: Path) -> Polyhedra:
     parts = sorted(path.glob("processor*"), key=lambda part: int(part.name.removeprefix("processor")))
     if parts or (path / POLY_MESH).is_dir():
         return _join([_read_foam(part / POLY_MESH) for part in parts or [path]])
-    if path.suffix not in (".vtu", ".msh"):
-        raise ConfigError(f"--export {path}: must be a file .vtu or .msh, or a case folder of OpenFOAM")
-    import meshio
-
+    readers = {".vtu": _read_meshio, ".msh": _read_meshio, ".xdmf": read_xdmf, ".cgns": read_cgns}
+    if path.suffix not in readers:
+        kinds = ", ".join(readers)
+        raise ConfigError(f"--export {path}: must be a file {kinds}, or a case folder of OpenFOAM")
     try:
-        mesh = meshio.read(path)
+        points, rows = readers[path.suffix](path)
     except (SystemExit, ValueError, KeyError, OSError, EOFError, meshio.ReadError) as error:
         raise InputError(f"{path}: cannot be read ({error}); export it again") from None
-    rows = [(width, mesh.cells_dict[kind]) for kind, width in WIDTHS.items() if kind in mesh.cells_dict]
-    if path.suffix == ".vtu":  # meshio turns VTK's wedges over, as VTK's page of them asks, but not VTK's measures
-        rows = [(width, some[:, MIRRORED] if width == 6 else some) for width, some in rows]
     cells = np.full((sum(len(some) for _, some in rows), 6), NO_CORNER)
     first = 0
     for width, some in rows:
         cells[first : first + len(some), :width] = some
         first += len(some)
-    return _checked(path, Polyhedra(np.asarray(mesh.points, np.float64), *list_faces(cells)))
+    return _checked(path, Polyhedra(np.asarray(points, np.float64), *list_faces(cells)))
+
+
+def _read_meshio(path: Path) -> Cells:
+    mesh = meshio.read(path)
+    rows = [(width, mesh.cells_dict[kind]) for kind, width in WIDTHS.items() if kind in mesh.cells_dict]
+    if path.suffix == ".vtu":  # meshio turns VTK's wedges over, as VTK's page of them asks, but not VTK's measures
+        rows = [(width, some[:, MIRRORED] if width == 6 else some) for width, some in rows]
+    return mesh.points, rows
 
 
 def _read_foam(folder: Path) -> Polyhedra:

@@ -323,6 +323,17 @@ def _characters(text: str) -> NDArray[np.int8]:
     return np.frombuffer(text.encode(), np.int8)
 
 
+def read_cgns(path: Path) -> tuple[NDArray[np.float64], list[tuple[int, Ints]]]:
+    """Read the points of an exported mesh, and its cells by number of corners; errors of h5py."""
+    with h5py.File(path) as file:
+        (zone,) = (node for node in file[BASE].values() if node.attrs.get("label") == b"Zone_t")
+        points = np.stack([zone[f"GridCoordinates/Coordinate{axis}/ data"][:] for axis in "XYZ"], axis=1)
+        sections = [node for node in zone.values() if node.attrs.get("label") == b"Elements_t"]
+        kinds = {element: n for n, element in SOLIDS.items()}
+        cells = [(kinds.get(int(node[" data"][0]), 0), node["ElementConnectivity/ data"]) for node in sections]
+        return points, [(n, rows[:].reshape(-1, n).astype(np.int64) - 1) for n, rows in cells if n]
+
+
 FORMAT = Format(
     "mesh and named patches as CGNS in HDF5", export_cgns, options=(*PER_BUILDING, *CELL_KINDS), suffix=".cgns"
 )

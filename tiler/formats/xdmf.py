@@ -36,6 +36,7 @@ HEAD = '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
 TOPOLOGIES = {4: "Tetrahedron", 6: "Wedge"}  # of cells, by their corners
 MIXED = np.array([0, 0, 0, 0, 6, 7, 8])  # XDMF's numbers of tetrahedra, pyramids and wedges, by corners
 SIDES = "sides"  # quadrilaterals of the boundary
+Ints = NDArray[np.int64]
 Rows = dict[str, tuple[int, int]]  # rows and columns of each data set
 TAIL = "  </Domain>\n</Xdmf>\n"
 
@@ -195,6 +196,22 @@ def _render(data: str, rows: Rows, n_cells: int, origin: str) -> str:
         grids.append(grid(SIDES, "Quadrilateral", SIDES, names))
     place = [f'    <Information Name="origin" Value="{origin}"/>\n'] if origin else []
     return HEAD + "".join([*place, *grids]) + TAIL
+
+
+def read_xdmf(path: Path) -> tuple[NDArray[np.float64], list[tuple[int, Ints]]]:
+    """Read the points of an exported mesh, and its cells by number of corners; errors of h5py."""
+    with h5py.File(path.with_suffix(DATA)) as file:
+        points, cells = file["points"][:], file["cells"][:]
+    if cells.ndim == 2:
+        return points, [(cells.shape[1], cells)]
+    width = {kind: int(n) for n, kind in enumerate(MIXED) if kind}
+    start, end = {n: list[int]() for n in width.values()}, 0
+    kinds = cells.tolist()
+    while end < len(kinds):
+        n = width[kinds[end]]
+        start[n].append(end + 1)
+        end += n + 1
+    return points, [(n, cells[np.array(first, np.int64)[:, None] + np.arange(n)]) for n, first in start.items()]
 
 
 FORMAT = Format(

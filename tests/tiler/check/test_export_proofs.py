@@ -21,7 +21,8 @@ LAYERS = (*HYBRID, "--prism-layers", "4")
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("msh", LAYERS), ("openfoam", HYBRID), ("openfoam", (*HYBRID, "--parts", "3"))]
+    ("name", "words"),
+    [("xdmf", LAYERS), ("cgns", LAYERS), ("openfoam", HYBRID), ("openfoam", (*HYBRID, "--parts", "3"))],
 )
 def test_exports_of_a_run_are_proved(
     small_run: Path, exported: Exported, capsys: pytest.CaptureFixture[str], name: str, words: tuple[str, ...]
@@ -115,7 +116,7 @@ def test_a_fault_of_a_file_is_found(small_run: Path, exported: Exported, tmp_pat
     assert kinds_with(wedges[1:]) == {"face-open", "facet-missing", "volume"}
     turned = np.concatenate((wedges[:1, [3, 4, 5, 0, 1, 2]], wedges[1:], wedges[-1:]))
     assert {"cell-inverted", "face-same-side", "face-shared", "volume"} <= kinds_with(turned)
-    wrong = tmp_path / "text.vtu"
-    wrong.write_text("no mesh")
-    assert main(["check", str(small_run), "--export", str(wrong)]) == 1
+    for suffix in ("vtu", "cgns", "xdmf"):
+        (tmp_path / f"text.{suffix}").write_text("no mesh")
+        assert main(["check", str(small_run), "--export", str(tmp_path / f"text.{suffix}")]) == 1
     assert main(["check", str(small_run), "--export", str(tmp_path / "a.stl")]) == 2
