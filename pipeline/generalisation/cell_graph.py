@@ -9,74 +9,110 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-def join_small(
-    area: Array, pairs: Index, length: Array, limit: float, *, among: NDArray[np.bool_] | None = None
-) -> Index:
-    """Join small cells to the neighbour with the longest border, the smallest cell first.
+class SmallCells:
+    """Joins small cells to the neighbour with the longest border, the smallest first, in a region given by parts.
 
     Parameters
     ----------
-    area : float64, (n,)
-        Of each cell (m2).
-    pairs : int64, (p, 2)
-        Cells that share a border, each pair once.
-    length : float64, (p,)
-        Of that border (m).
     limit : float
-        Without `among`, cells below this are fragments, and any neighbour takes them. With `among`, cells up to
-        this are joined with each other (m2).
-    among : bool, (n,), optional
-        Cells that may be joined; no other takes part, nor one that has become greater than `limit`.
-
-    Returns
-    -------
-    int64, (n,)
-        For each cell the smallest index of those that it is joined with.
+        Cells below this are fragments, and any neighbour takes them; with `alike` cells up to this are joined with
+        each other (m2).
+    alike : bool
+        Whether only small cells take others in, until they are greater than `limit`.
 
     Notes
     -----
     A joined cell is a cell: it goes on while it is small. Of equal borders the greater neighbour, then the smaller
-    index is taken. With `among` no result is greater than twice the limit. O(p log p); memory holds some hundred
-    bytes for each border of a small cell.
+    number is taken. With `alike` no result is greater than twice the limit.
 
-    Examples
-    --------
-    >>> join_small(np.array([5.0, 90, 80]), np.array([[0, 1], [0, 2]]), np.array([2.0, 3]), 10)
-    array([0, 1, 0])
+    The result is that of all cells at once. Joining a cell depends on its neighbours and changes their borders, so
+    cells three borders apart do not matter to each other. A cell is joined when all cells within two borders are
+    known, and no smaller one of them waits. Memory holds cells that wait and their neighbours, some hundred bytes
+    for each border: those near the end of the known part, and beside a cell that reaches beyond it.
     """
-    size, root = area.tolist(), np.arange(len(area))
-    beside: dict[int, dict[int, float]] = {}
-    # Cells only grow, so that borders of which none can be looked at may be left out: those of two large cells, or
-    # with `among` of one.
-    small = area < limit if among is None else among & (area <= limit)
-    used = small[pairs].any(axis=1) if among is None else small[pairs].all(axis=1)
-    for (a, b), border in zip(pairs[used].tolist(), length[used].tolist(), strict=True):
-        beside.setdefault(a, {})[b] = border
-        beside.setdefault(b, {})[a] = border
 
-    def is_small(cell: int) -> bool:
-        return bool(size[cell] < limit if among is None else size[cell] <= limit)
+    def __init__(self, limit: float, *, alike: bool = False) -> None:
+        self.limit, self.alike, self.taken = limit, alike, 0  # how many were taken in by others
+        self.size: dict[int, float] = {}
+        self.first: dict[int, int] = {}  # the smallest number that a cell took in, where that is below its own
+        self.beside: dict[int, dict[int, float]] = {}
 
-    waiting = [(size[cell], cell) for cell in beside if is_small(cell)]
-    heapq.heapify(waiting)
-    while waiting:
-        known, cell = heapq.heappop(waiting)
-        if cell not in beside or known != size[cell]:
-            continue
-        near = [other for other in beside[cell] if among is None or is_small(other)]
-        if not near:
-            continue
-        into = max(near, key=lambda other: (beside[cell][other], size[other], -other))
-        for other, border in beside.pop(cell).items():
-            del beside[other][cell]
-            if other != into:
-                beside[into][other] = beside[other][into] = beside[into].get(other, 0.0) + border
-        size[into] += size[cell]
-        root[cell] = into
-        if is_small(into):
-            heapq.heappush(waiting, (size[into], into))
-    while (root[root] != root).any():
-        root = root[root]
-    first = np.full(len(area), len(area))
-    np.minimum.at(first, root, np.arange(len(area)))
-    return first[root]
+    def add(self, cells: Index, area: Array, pairs: Index, length: Array) -> None:
+        """Add cells with ascending numbers (n,), greater than all before, and borders by the lesser number.
+
+        Parameters
+        ----------
+        cells : int64, (n,)
+            With `alike` only those that may be joined.
+        area : float64, (n,)
+            Of each (m2).
+        pairs : int64, (p, 2)
+            Cells that share a border, the lesser number first, each pair once. The other one may be still to come.
+        length : float64, (p,)
+            Of that border (m).
+        """
+        self.size.update(zip(cells.tolist(), area.tolist(), strict=True))
+        for (a, b), border in zip(pairs.tolist(), length.tolist(), strict=True):
+            if a in self.size and (self.is_small(a) or not self.alike):
+                self.beside.setdefault(a, {})[b] = border
+                self.beside.setdefault(b, {})[a] = border
+
+    def is_small(self, cell: int) -> bool:
+        """Whether a cell is to be joined."""
+        size = self.size[cell]
+        return size <= self.limit if self.alike else size < self.limit
+
+    def join(self, end: int) -> list[tuple[int, int]]:
+        """Join what can be joined when all cells with numbers below `end` are known.
+
+        Returns
+        -------
+        list of (int, int)
+            A cell, and the one that stands for it from then on, in the order in which it happened: that which took
+            it in, at last the smallest number of all that became one. What is named here is not given again.
+        """
+        self._drop(end)
+        beside, size, joined = self.beside, self.size, []
+        ahead = [cell for cell in beside if cell >= end]
+        blocked = {*ahead}.union(*(beside[cell] for cell in ahead))  # what waits, and what is next to it
+        waiting = [(size[cell], cell) for cell in beside if cell < end and self.is_small(cell)]
+        heapq.heapify(waiting)
+        while waiting:
+            known, cell = heapq.heappop(waiting)
+            if cell not in beside or known != size[cell]:
+                continue
+            if cell in blocked or not blocked.isdisjoint(beside[cell]):
+                blocked.add(cell)
+                blocked.update(beside[cell])
+                continue
+            near = [other for other in beside[cell] if not self.alike or self.is_small(other)]
+            if not near:
+                continue
+            into = max(near, key=lambda other: (beside[cell][other], size[other], -other))
+            for other, border in beside.pop(cell).items():
+                del beside[other][cell]
+                if other != into:
+                    beside[into][other] = beside[other][into] = beside[into].get(other, 0.0) + border
+            size[into] += size.pop(cell)
+            self.first[into] = min(self.first.get(into, into), self.first.pop(cell, cell))
+            joined.append((cell, into))
+            self.taken += 1
+            if self.is_small(into):
+                heapq.heappush(waiting, (size[into], into))
+        self._drop(end)
+        for cell in size.keys() - self.beside.keys():
+            del size[cell]
+            if (first := self.first.pop(cell, cell)) != cell:
+                joined.append((cell, first))
+        return joined
+
+    def _drop(self, end: int) -> None:
+        """Drop borders of which none can be looked at, as cells only grow, and cells that are left alone."""
+        for cell, near in self.beside.items():
+            for other in [other for other in near if not self._counts(cell, other, end)]:
+                del near[other]
+        self.beside = {cell: near for cell, near in self.beside.items() if near}
+
+    def _counts(self, cell: int, other: int, end: int) -> bool:
+        small = [one >= end or (one in self.size and self.is_small(one)) for one in (cell, other)]
+        return all(small) if self.alike else any(small)

@@ -7,11 +7,11 @@ seconds of the driver and of tasks, and the private memory of the driver.
 """
 
 import argparse
-import copy
 import json
+import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,27 +19,30 @@ from unittest.mock import patch
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from tests.benchmarks.countries import COUNTRIES, outline
 from tests.benchmarks.simulate import memory
 from tiler.convert.features import unique_name
 from tiler.generalisation import generalise as whole
 from tiler.generalisation.options import Asked, Inputs
-from tiler.generalisation.shards import Shards, Tile
+from tiler.generalisation.region_cells import read_rows
+from tiler.generalisation.shards import DiskSet, Shards, Tile
 from tiler.generalisation.summary import Told
-from tiler.generalisation.tile_cells import Work
-from tiler.generalisation.tile_levels import CellRecord
+from tiler.generalisation.tile_cells import Work, read_numbers
 
-Recorded = dict[tuple[str, Tile], Any]
+Recorded = Mapping[tuple[str, Tile], Any]
 
 
-def record(footprints: Path, folder: Path) -> tuple[Recorded, list[Tile], float]:
-    """Generalise some tiles for real; gives what each step told of each, the tiles, and the seconds of all."""
-    found: Recorded = {}
+def record(footprints: Path, folder: Path) -> tuple[Shards, Recorded, float]:
+    """Generalise some tiles for real; gives their files, what steps told the driver, and the seconds of all."""
+    found: dict[tuple[str, Tile], Any] = {}
     seconds = [0.0]
 
     def keep(step: Callable[[Work], Any], works: Iterator[Work], _: int) -> Iterator[Any]:
         for work in works:
+            if step.__name__ == "make_cells" and not (folder / "sample").exists():
+                shutil.copytree(work.shards.folder, folder / "sample")
             begin = time.process_time()
             found[step.__name__, work.tile] = step(work)
             seconds[0] += time.process_time() - begin
@@ -47,70 +50,95 @@ def record(footprints: Path, folder: Path) -> tuple[Recorded, list[Tile], float]
 
     with patch.object(whole, "map_in_order", keep):
         whole.generalise(Inputs(footprints=footprints), folder / "blocks.gpkg", Asked(), overwrite=True)
-    tiles = sorted(tile for name, tile in found if name == "sort_buildings")
-    return found, tiles, seconds[0]
+    return Shards(folder / "sample", Asked().tile_size), found, seconds[0]
 
 
 class Country(Shards):
-    """Shards of a country whose tiles all have buildings, and nothing that stands for itself."""
+    """Shards of a country whose tiles are those of a sample, again and again; nothing stands for itself.
+
+    What the steps of a tile wrote for the driver is that of a tile of the sample.
+    """
+
+    def __init__(self, folder: Path, sample: Shards, known: list[Tile]) -> None:
+        super().__init__(folder, sample.size)
+        tiles = np.array(sample.tiles("sides"))
+        self.sample, self.known, self.peak = sample, known, memory()
+        self.low, self.span = tiles.min(axis=0), np.ptp(tiles, axis=0) + 1
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set what this class has more than its base, which is frozen."""
+        object.__setattr__(self, name, value)
+
+    def append(self, kind: str, tile: Tile, value: Any) -> None:
+        """Put a value behind those of its tile, and look at the memory."""
+        super().append(kind, tile, value)
+        self.peak = max(self.peak, memory())
+
+    def of(self, tile: Tile) -> Tile:
+        """Give the tile of the sample."""
+        i, j = (self.low + (np.array(tile) - self.low) % self.span).tolist()
+        return i, j
 
     def tiles(self, kind: str) -> list[Tile]:
-        """List the tiles with buildings."""
-        return [(i, j) for i, j in json.loads((self.folder / "tiles.json").read_text())]
+        """List the tiles with values of a kind."""
+        return self.known if kind == "dealt" else super().tiles(kind)
 
     def read(self, kind: str, tile: Tile) -> list[Any]:
         """Give the values of a tile."""
-        return [np.empty(0, object)] if kind == "standing" else super().read(kind, tile)
+        if kind == "standing":
+            return [np.empty(0, object)]
+        return self.sample.read(kind, self.of(tile)) if kind in ("chains", "sides") else super().read(kind, tile)
 
 
-def simulate(recorded: Recorded, sample: Sequence[Tile], tiles: list[Tile], folder: Path) -> dict[str, float]:
+def simulate(sample: Shards, counts: Recorded, tiles: list[Tile], folder: Path) -> dict[str, float]:
     """Take a country through the driver's part; gives seconds, and memory (MB) beyond what the process had."""
-    low, high = np.min(sample, axis=0), np.max(sample, axis=0)
-    span = high - low + 1
-    before, peak = memory(), memory()
+    folder.mkdir()
+    shards = Country(folder, sample, tiles)
+    work = Work(shards, (0, 0), Asked(), axis=True, rim=shapely.to_wkb(shapely.Point()))
+    before, tasks = memory(), 0.0
 
-    def of(tile: Tile) -> Tile:
-        i, j = (low + (np.array(tile) - low) % span).tolist()
-        return i, j
+    def pair(tile: Tile) -> NDArray[np.int64]:
+        """Move the pairs of a tile of the sample, some of whose neighbours may be missing here."""
+        here, there = (read_numbers(one, "buildings") for one in (shards, sample))
+        old = counts["pair_buildings", shards.of(tile)]
+        places, rows = there.places(old.ravel())
+        shift = np.array(tile) - shards.of(tile)
+        first = np.array([here.first((i, j)) for i, j in (places + shift).tolist()], np.int64)
+        return (first + rows).reshape(-1, 2)[(first >= 0).reshape(-1, 2).all(axis=1)]
 
     def each(step: Callable[[Work], Any], some: Sequence[Tile], /) -> Iterator[Any]:
-        nonlocal peak
+        nonlocal tasks
         for tile in some:
+            begin = time.process_time()
             if step.__name__ == "make_cells":
-                number = shards.read("cells", tile)[0].number
+                number = np.unique(read_rows(shards, 2, tile)[0])
                 names = np.array([f"C{value:013x}" for value in number.tolist()], object)
-                yield CellRecord(number, names, number % 8 == 0)
+                shards.append("use", tile, (names, number % 8 == 0))
+                found = None
             elif step.__name__ == "pair_buildings":
-                shift = np.array(tile) - of(tile)
-                pairs = recorded[step.__name__, of(tile)]
-                near = [((one[0] + shift[0], one[1] + shift[1]), rows) for one, rows in pairs]
-                yield [(one, rows) for one, rows in near if one in known]
+                found = pair(tile)
+            elif step.__name__ == "meet_tiles":
+                found = step(replace(work, tile=tile))
             else:
-                yield copy.deepcopy(recorded.get((step.__name__, of(tile))))  # no tile's is that of another
-        peak = max(peak, memory())
+                found = counts.get((step.__name__, shards.of(tile)))
+            tasks += time.process_time() - begin
+            yield found
 
-    shards = Country(folder, Asked().tile_size)
-    (folder / "tiles.json").write_text(json.dumps(tiles))
-    known = set(tiles)
-    n = sum(recorded["sort_buildings", of(tile)][0] for tile in tiles)
     begin = time.process_time()
-    seen: set[int] = set()
+    seen, n = DiskSet(), sum(counts["sort_buildings", shards.of(tile)][0] for tile in tiles)
     for k in range(n):
         unique_name(f"NL.IMBAG.Pand.{k:016d}", seen)
-    peak = max(peak, memory())
     del seen
-    work = Work(shards, (0, 0), Asked(), axis=True, rim=shapely.to_wkb(shapely.Point()))
-    cells = whole._make_cells(tiles, work, each, Told())
-    peak = max(peak, memory())
-    whole._make_levels(cells, work, each)
-    peak = max(peak, memory())
+    numbers = whole._make_cells(tiles, work, each, Told())
+    owners = whole._make_levels(numbers, work, each)
+    cells = sum(len(shards.read("use", tile)[0][0]) for tile in owners)
     return {
         "tiles": len(tiles),
         "buildings": n,
-        "cells": len(cells.area),
-        "driver_seconds": round(time.process_time() - begin, 1),
-        "driver_memory_MB": round(peak - before, 1),
-        "bytes_a_building": round((peak - before) * 1e6 / n, 1),
+        "cells": cells,
+        "driver_seconds": round(time.process_time() - begin - tasks, 1),
+        "driver_memory_MB": round(shards.peak - before, 1),
+        "bytes_a_building": round((shards.peak - before) * 1e6 / n, 1),
     }
 
 
@@ -123,15 +151,15 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        recorded, sample, seconds = record(given.footprints, folder)
+        sample, counts, seconds = record(given.footprints, folder)
         shape = outline(replace(COUNTRIES[given.country], tile_size=1000.0), given.tiles)
         west, south, east, north = (int(value // 1000) for value in shape.bounds)
         i, j = (part.ravel() for part in np.meshgrid(np.arange(west, east + 1), np.arange(south, north + 1)))
         inside = shapely.contains_xy(shape, 1000.0 * i + 500, 1000.0 * j + 500)
         tiles = sorted(zip(i[inside].tolist(), j[inside].tolist(), strict=True))
-        told = simulate(recorded, sample, tiles, folder)
-        told["task_hours"] = round(seconds / len(sample) * len(tiles) / 3600, 2)
-        told["largest_disk_MB"] = round(sum(path.stat().st_size for path in folder.rglob("*.pkl")) / 1e6)
+        told = simulate(sample, counts, tiles, folder / "country")
+        told["task_hours"] = round(seconds / len(sample.tiles("sides")) * len(tiles) / 3600, 2)
+        told["disk_MB"] = round(sum(path.stat().st_size for path in (folder / "country").rglob("*.pkl")) / 1e6)
         print(json.dumps(told, indent=1))
 
 

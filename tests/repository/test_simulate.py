@@ -9,6 +9,7 @@ from tests.benchmarks.recorded import recorded_stages
 from tests.benchmarks.simulate import run_disk, run_virtual
 from tests.benchmarks.simulate_blocks import record, simulate
 from tests.helpers.synthetic import city_files
+from tiler.generalisation.region_cells import read_areas
 
 
 def test_every_country_has_its_recorded_tiles() -> None:
@@ -38,12 +39,11 @@ def test_a_small_country_goes_on_from_its_half(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_country_of_blocks_has_the_cells_of_its_tiles(tmp_path: Path) -> None:
     files = city_files(tmp_path / "city", size=2000.0, buildings=200, density=0.0)
-    recorded, sample, seconds = record(Path(files["footprints"]), tmp_path)
-    own = sum(recorded["sort_buildings", tile][0] for tile in sample)
-    (tmp_path / "country").mkdir()
-    tiles = [(i, j) for i in range(sample[0][0], sample[0][0] + 4) for j in range(sample[0][1], sample[0][1] + 4)]
-    told = simulate(recorded, sample, tiles, tmp_path / "country")
-    assert (len(sample), told["buildings"]) == (4, 4 * own)
-    cells = sum(len(one.number) for (step, _), one in recorded.items() if step == "make_cells")
+    sample, counts, seconds = record(Path(files["footprints"]), tmp_path)
+    own = sample.tiles("sides")
+    (i, j), buildings = own[0], sum(counts["sort_buildings", tile][0] for tile in own)
+    told = simulate(sample, counts, [(i + a, j + b) for a in range(4) for b in range(4)], tmp_path / "country")
+    assert (len(own), told["buildings"]) == (4, 4 * buildings)
+    cells = sum(len(read_areas(sample, 2, tile)[0]) for tile in own)
     assert 0.8 < told["cells"] / (4 * cells) < 1.1  # those on the sides of the town are joined with their copies
     assert seconds > 0

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +96,17 @@ def owners_of(building: ModelBuilding) -> list[str]:
     return list(dict.fromkeys([building.id, *building.attributes, *(shape.owner for shape in building.shapes)]))
 
 
-def unique_name(name: str, seen: set[int]) -> str:
+class Seen(Protocol):
+    """Whole numbers that were there before: a set, or one on a disk."""
+
+    def __contains__(self, number: object, /) -> bool:
+        """Whether it was."""
+
+    def add(self, number: int, /) -> None:
+        """Add one."""
+
+
+def unique_name(name: str, seen: Seen) -> str:
     """Give a name that was not given before, with a number behind it where it was; 8 bytes of each are kept."""
     found, number = name, 1
     while hash(found) in seen:

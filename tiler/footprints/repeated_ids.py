@@ -24,12 +24,15 @@ def find_repeated_ids(layer: Layer, id_name: str, *, batch: int = BATCH) -> set[
     if not id_name:
         return set()
     columns = id_columns(layer, id_name)
-    parts = [
-        _hashes(read_ids(layer, id_name, features))
-        for features in scan_layer(layer, columns, None, geometry=False, batch=batch)
-    ]
-    hashes = np.sort(np.concatenate([np.empty(0, np.int64), *parts]))
-    twice = np.unique(hashes[1:][np.diff(hashes) == 0])
+    hashes = np.concatenate(
+        [np.empty(0, np.int64)]
+        + [
+            _hashes(read_ids(layer, id_name, features))
+            for features in scan_layer(layer, columns, None, geometry=False, batch=batch)
+        ]
+    )
+    hashes.sort()
+    twice = np.unique(hashes[1:][hashes[1:] == hashes[:-1]])
     twice = twice[twice != hash("")]
     return _different(layer, id_name, twice, batch) if len(twice) else set()
 

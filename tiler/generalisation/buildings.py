@@ -26,6 +26,7 @@ from tiler.footprints.footprint_index import scan_footprints
 from tiler.footprints.footprint_source import open_source as open_footprints
 from tiler.footprints.plan_shapes import find_extent
 from tiler.generalisation.options import Asked, Inputs, Landmarks
+from tiler.generalisation.shards import DiskSet
 from tiler.generalisation.summary import Told
 from tiler.georeference.crs import crs_name, horizontal_crs, parse_crs, utm_crs
 from tiler.georeference.footprints import footprint_frame
@@ -210,8 +211,8 @@ def _is_set(value: object, wanted: str) -> bool:
 
 
 def _finish(batches: Iterator[Buildings], inputs: Inputs, asked: Asked, told: Told) -> Iterator[Buildings]:
-    """Mend outlines, give missing heights, make ids unique, and tell landmarks; 8 bytes of each id are kept."""
-    seen: set[int] = set()
+    """Mend outlines, give missing heights, make ids unique, and tell landmarks."""
+    seen = DiskSet()
     for given in batches:
         flat = shapely.force_2d(given.outlines)
         outlines = mend_polygons(flat)

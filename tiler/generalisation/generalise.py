@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, GeometryError, InputError
 from pipeline.generalisation.barriers import GRID, deal_segments, explode_lines, split_at_grid
-from pipeline.generalisation.cell_graph import join_small
-from pipeline.geometry.components import join_pairs
 from tiler.convert.convert import refuse_output
 from tiler.executors.in_order import map_in_order
 from tiler.footprints.building_parts import mend_polygons
@@ -26,12 +24,12 @@ from tiler.generalisation.buildings import open_buildings
 from tiler.generalisation.city_json import HierarchyWriter
 from tiler.generalisation.gpkg_layers import LayerWriter
 from tiler.generalisation.options import Asked, Inputs
-from tiler.generalisation.region_cells import Cells, join_cells
+from tiler.generalisation.region_cells import deal_round, join_across, join_small
 from tiler.generalisation.rows import LEVELS
-from tiler.generalisation.shards import Shards, Tile, by_tile
+from tiler.generalisation.shards import Numbers, Shards, Tile, by_tile
 from tiler.generalisation.summary import LevelSum, Told, describe_levels, table_lines
-from tiler.generalisation.tile_cells import Work, pair_buildings, part_tile, sort_buildings
-from tiler.generalisation.tile_levels import CellList, CellRecord, GroupList, make_cells, make_levels
+from tiler.generalisation.tile_cells import Work, meet_tiles, pair_buildings, part_tile, sort_buildings
+from tiler.generalisation.tile_levels import make_cells, make_levels
 from tiler.georeference.crs import box_words, crs_text
 from tiler.store.atomic import replacing
 from tiler.vectors.features import to_objects
@@ -40,7 +38,6 @@ from tiler.vectors.layers import split_layer
 
 MOST_TILES = 1_000_000
 Result = TypeVar("Result")
-Index = NDArray[np.int64]
 
 
 class Each(Protocol):
@@ -101,7 +98,7 @@ def generalise(
     -----
     The inputs are read once, and dealt out to tiles in a temporary folder; then each step works on a tile, or on
     the cells that a tile owns: those whose first piece lies in it. Memory holds a tile with its neighbours, the
-    largest cell, and some hundred bytes for each cell of the region.
+    largest cell, the numbers of some columns of tiles, and some hundred bytes for each tile.
     """
     files = Outputs(output)
     if output.suffix != ".gpkg":
@@ -135,9 +132,7 @@ def generalise(
                 f"{box_words(rim.bounds)}; is a coordinate wrong? --bounds takes a part, --tile-size larger tiles"
             )
         tiles = [t for t in shards.covered(rim.bounds) if rim.intersects(shapely.box(*shards.box(t)))]
-        cells = _make_cells(tiles, work, each, told)
-        owners = _make_levels(cells, work, each)
-        told.counts["fragments joined to a neighbour"] = cells.fragments
+        owners = _make_levels(_make_cells(tiles, work, each, told), work, each)
         levels = _write(files, owners, shards, crs, told)
     with replacing(files.numbers) as part:
         numbers = {"levels": levels, "counts": told.known(), "notes": told.said}
@@ -211,75 +206,43 @@ def _deal_others(geometry: NDArray[np.object_], shards: Shards) -> None:
                 shards.append("others", tile, to_objects([own]))
 
 
-def _make_cells(tiles: Sequence[Tile], work: Work, each: Each, told: Told) -> Cells:
+def _make_cells(tiles: Sequence[Tile], work: Work, each: Each, told: Told) -> Numbers:
+    """Make the pieces of all tiles, and cells of them; gives the numbers of the pieces."""
     shards = work.shards
     own = shards.tiles("dealt")
     counts, copies = np.array(list(each(sort_buildings, own))).T
     told.counts["buildings with the outline of another one, left out"] += int(copies.sum())
     if work.axis:
-        start = dict(zip(own, np.cumsum([0, *counts]).tolist(), strict=False))
-        pairs = [np.empty((0, 2), np.int64)]
-        for tile, found in zip(own, each(pair_buildings, own), strict=True):
-            pairs += [near + np.array([start[tile], start[other]]) for other, near in found]
-        names = join_pairs(int(counts.sum()), np.concatenate(pairs))
-        for tile, n in zip(own, counts.tolist(), strict=True):
-            shards.append("blocks", tile, names[start[tile] : start[tile] + n])
-    return join_cells(dict(zip(tiles, each(part_tile, tiles), strict=True)), work.asked.fragment)
+        numbers = Numbers.count(own, counts)
+        shards.append("buildings-numbers", (0, 0), numbers)
+        join_across(numbers, each(pair_buildings, own), shards, "blocks")
+    numbers = Numbers.count(tiles, each(part_tile, tiles))
+    shards.append("pieces-numbers", (0, 0), numbers)
+    join_across(numbers, each(meet_tiles, tiles), shards, "names-0")
+    deal_round(numbers, shards, 0)
+    told.counts["fragments joined to a neighbour"] = join_small(numbers, shards, 1, work.asked.fragment)
+    deal_round(numbers, shards, 1)
+    return numbers
 
 
-def _make_levels(cells: Cells, work: Work, each: Each) -> list[Tile]:
+def _make_levels(numbers: Numbers, work: Work, each: Each) -> list[Tile]:
     """Make all levels tile by tile; gives the tiles that own cells."""
-    shards, n = work.shards, len(cells.area)
-    first = np.full(n, len(cells.cell))
-    np.minimum.at(first, cells.cell, np.arange(len(cells.cell)))
-    owner = cells.tile[first]
-    order = np.argsort(cells.cell, kind="stable")
-    start = np.searchsorted(cells.cell[order], np.arange(n + 1))
-    owners = []
-    for tile, numbers in by_tile(owner):
-        rows = np.sort(np.concatenate([order[start[k] : start[k + 1]] for k in numbers.tolist()]))
-        shards.append("cells", tile, CellList(numbers, cells.cell[rows], cells.tile[rows], cells.piece[rows]))
-        owners.append(tile)
-    records: list[CellRecord] = list(each(make_cells, owners))
-    number = np.concatenate([record.number for record in records])
-    ids, use = np.empty(n, object), np.zeros(n, np.bool_)
-    ids[number] = np.concatenate([record.id for record in records])
-    use[number] = np.concatenate([record.use for record in records])
-    group = join_small(
-        cells.area, cells.pairs, cells.length, work.asked.most_area,
-        among=use & (cells.area <= work.asked.most_area),
-    )  # fmt: skip
-    _deal_groups(owners, owner, use, group, ids, shards)
-    _deal_cuts(owners, shards)
-    list(each(make_levels, owners))
-    return owners
-
-
-def _deal_groups(
-    owners: Sequence[Tile], owner: Index, use: NDArray[np.bool_], group: Index, ids: NDArray[np.object_],
-    shards: Shards,
-) -> None:  # fmt: skip
-    """Tell each tile the objects of LoD0A of its cells, and the cells of the objects that it owns."""
-    name = np.where(use, np.array([f"A{ids[k][1:]}" for k in group.tolist()], object), "")
-    member = np.flatnonzero(use)
-    member = member[np.lexsort((member, group[member]))]
-    cells_of = dict(by_tile(owner))
-    of_tile = {tile: member[rows] for tile, rows in by_tile(owner[group[member]])}
+    shards = work.shards
+    owners = shards.tiles("rows-2")
+    for _ in each(make_cells, owners):
+        pass
+    join_small(numbers, shards, 2, work.asked.most_area, alike=True)
     for tile in owners:
-        mine = of_tile.get(tile, np.empty(0, np.int64))
-        heads, row = np.unique(group[mine], return_inverse=True)
-        groups = GroupList(
-            name[cells_of[tile]], to_objects([name[k] for k in heads.tolist()]), row.ravel(), mine, owner[mine]
-        )
-        shards.append("groups", tile, groups)
-
-
-def _deal_cuts(owners: Sequence[Tile], shards: Shards) -> None:
-    """Deal out what stands for itself to the tiles where it may stand in a block."""
-    for tile in owners:
+        cells, groups = shards.read("names-2", tile)[0]
+        use = shards.read("use", tile)[0][1]
+        for owner, rows in by_tile(numbers.places(groups[use])[0]):
+            shards.append("groups", owner, (groups[use][rows], cells[use][rows]))
         for outline in shards.read("standing", tile)[0]:
             for near in shards.covered(outline.bounds):
                 shards.append("cuts", near, to_objects([outline]))
+    for _ in each(make_levels, owners):
+        pass
+    return owners
 
 
 def _write(

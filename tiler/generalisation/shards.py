@@ -1,9 +1,10 @@
 """What waits in a folder tile by tile, so that memory holds a tile and not the region."""
 
 import pickle
-from collections.abc import Iterable, Iterator
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,10 @@ class Shards:
             while file.peek(1):
                 found.append(pickle.load(file))
         return found
+
+    def drop(self, kind: str, tile: Tile) -> None:
+        """Delete the values of a tile, if there are any."""
+        self._path(kind, tile).unlink(missing_ok=True)
 
     def tiles(self, kind: str) -> list[Tile]:
         """List the tiles that have values of a kind, in order."""
@@ -83,6 +88,63 @@ class _Pickler(pickle.Pickler):
 
 def _read_geometries(wkb: list[bytes]) -> NDArray[np.object_]:
     return np.asarray(shapely.from_wkb(wkb), np.object_)
+
+
+class DiskSet:
+    """Whole numbers in a temporary file, of which some megabytes are in memory."""
+
+    def __init__(self) -> None:
+        self.table = sqlite3.connect("", isolation_level=None)  # no name: on the disk, gone with the object
+        self.table.execute("pragma journal_mode = off")
+        self.table.execute("create table numbers (number integer primary key)")
+        self.table.execute("begin")
+
+    def __contains__(self, number: object) -> bool:
+        """Whether a number was added."""
+        return self.table.execute("select 1 from numbers where number = ?", (number,)).fetchone() is not None
+
+    def add(self, number: int) -> None:
+        """Add a number that is not there yet."""
+        self.table.execute("insert into numbers values (?)", (number,))
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """Numbers of things that lie in tiles, over the whole region: those of a tile follow each other.
+
+    Attributes
+    ----------
+    tiles : int64, (t, 2)
+        Column and row of each tile, ascending.
+    start : int64, (t + 1,)
+        First number of each tile, and the number of all.
+    """
+
+    tiles: NDArray[np.int64]
+    start: NDArray[np.int64]
+
+    @classmethod
+    def count(cls, tiles: Sequence[Tile], counts: Iterable[int]) -> "Numbers":
+        """Number so many things in each of some tiles, which ascend."""
+        start = np.cumsum(np.fromiter((0, *counts), np.int64))
+        return cls(np.array(tiles, np.int64).reshape(-1, 2), start)
+
+    def first(self, tile: Tile) -> int:
+        """Give the first number of a tile, -1 if the tile is not among them."""
+        low, high = np.searchsorted(self.tiles[:, 0], (tile[0], tile[0] + 1)).tolist()
+        row = low + int(np.searchsorted(self.tiles[low:high, 1], tile[1]))
+        return int(self.start[row]) if row < high and self.tiles[row, 1] == tile[1] else -1
+
+    def columns(self) -> Iterator[list[tuple[Tile, int, int]]]:
+        """Give tile, first number and end of numbers of each tile, those of a column of tiles together."""
+        rows = zip(map(tuple, self.tiles.tolist()), self.start[:-1].tolist(), self.start[1:].tolist(), strict=True)
+        for _, column in groupby(rows, key=lambda row: row[0][0]):
+            yield list(column)
+
+    def places(self, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Give the tile (n, 2) of each number, and its place in it."""
+        row = np.searchsorted(self.start, numbers, side="right") - 1
+        return self.tiles[row], numbers - self.start[row]
 
 
 def around(tile: Tile) -> list[Tile]:

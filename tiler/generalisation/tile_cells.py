@@ -7,11 +7,22 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.generalisation.barriers import deal_segments, split_at_grid
-from pipeline.generalisation.partition import Borders, find_borders, partition_tile
+from pipeline.generalisation.partition import (
+    APART,
+    EAST,
+    NORTH,
+    SOUTH,
+    WEST,
+    Borders,
+    find_borders,
+    match_sides,
+    partition_tile,
+)
 from pipeline.generalisation.street_axis import find_close_pairs, find_street_axis, smooth_pieces
+from pipeline.geometry.components import join_pairs
 from tiler.generalisation.buildings import Buildings, join_buildings
 from tiler.generalisation.options import Asked
-from tiler.generalisation.shards import Shards, Tile, around
+from tiler.generalisation.shards import Numbers, Shards, Tile, around
 
 REACH = 200.0  # m; without roads, buildings farther from a place do not part cells there
 
@@ -41,6 +52,7 @@ def sort_buildings(work: Work) -> tuple[int, int]:
     """Take each outline of a tile once; gives the number of buildings, and that of copies, which are left out.
 
     The building has the lowest id of its copies and the greatest height, and is a landmark where one of them is.
+    Without roads those that are closer than a street are chained: the first row of its chain for each.
     """
     dealt = join_buildings(work.shards.read("dealt", work.tile))
     _, outline = np.unique(shapely.to_wkb(shapely.normalize(dealt.outlines)), return_inverse=True)
@@ -52,7 +64,11 @@ def sort_buildings(work: Work) -> tuple[int, int]:
         ground=np.fmax.reduceat(dealt.ground[order], start),
         landmark=np.logical_or.reduceat(dealt.landmark[order], start),
     )
-    work.shards.append("buildings", work.tile, once.take(np.argsort(order[start])))
+    once = once.take(np.argsort(order[start]))
+    work.shards.append("buildings", work.tile, once)
+    if work.axis:
+        close = find_close_pairs(once.outlines, once.outlines, work.asked.block_gap)
+        work.shards.append("chains", work.tile, join_pairs(len(once), close))
     return len(start), len(order) - len(start)
 
 
@@ -61,18 +77,31 @@ def read_buildings(shards: Shards, tile: Tile) -> Buildings:
     return join_buildings(shards.read("buildings", tile))
 
 
-def pair_buildings(work: Work) -> list[tuple[Tile, Index]]:
-    """List the buildings that are closer to those of this tile than a street, by the tile of the other one."""
-    own = read_buildings(work.shards, work.tile).outlines
-    found = []
-    for tile in around(work.tile):
-        pairs = find_close_pairs(own, read_buildings(work.shards, tile).outlines, work.asked.block_gap)
-        found.append((tile, pairs))
-    return [(tile, pairs) for tile, pairs in found if len(pairs)]
+def read_numbers(shards: Shards, kind: str) -> Numbers:
+    """Read the numbers of the pieces or buildings of the region."""
+    found: Numbers = shards.read(f"{kind}-numbers", (0, 0))[0]
+    return found
 
 
-def part_tile(work: Work) -> Pieces:
-    """Part a tile into pieces of cells, and register its buildings; polygons go into a file."""
+def pair_buildings(work: Work) -> Index:
+    """List the chains of buildings that are closer to those of this tile than a street, in the tiles behind it.
+
+    Gives pairs (p, 2), each once: numbers of the first building of each chain.
+    """
+    numbers = read_numbers(work.shards, "buildings")
+    own, chain = read_buildings(work.shards, work.tile).outlines, work.shards.read("chains", work.tile)[0]
+    pairs = [np.empty((0, 2), np.int64)]
+    for tile in around(work.tile)[5:]:
+        if (first := numbers.first(tile)) >= 0:
+            other = read_buildings(work.shards, tile).outlines
+            one, two = find_close_pairs(own, other, work.asked.block_gap).T
+            two = first + work.shards.read("chains", tile)[0][two]
+            pairs.append(np.column_stack((numbers.first(work.tile) + chain[one], two)))
+    return np.unique(np.concatenate(pairs), axis=0)
+
+
+def part_tile(work: Work) -> int:
+    """Part a tile into pieces of cells, and register its buildings; all goes into files, the number is given."""
     box = work.shards.box(work.tile)
     rim = shapely.from_wkb(work.rim)
     segments = np.concatenate([np.empty((0, 4)), *work.shards.read("segments", work.tile)])
@@ -90,7 +119,39 @@ def part_tile(work: Work) -> Pieces:
         middle = shapely.point_on_surface(pieces)
         rows, nearest = shapely.STRtree(near).query_nearest(middle, all_matches=False)
         names[rows] = block[nearest]
-    return Pieces(find_borders(pieces, segments, box), names)
+    work.shards.append("sides", work.tile, Pieces(find_borders(pieces, segments, box), names))
+    return len(pieces)
+
+
+def meet_tiles(work: Work) -> Index:
+    """Find the pieces that are one with those of the tiles to the east and north; gives pairs of numbers (p, 2).
+
+    All pieces and borders of the tile go into files.
+    """
+    numbers = read_numbers(work.shards, "pieces")
+    own, first = work.shards.read("sides", work.tile)[0], numbers.first(work.tile)
+    row = first + np.arange(len(own.block))
+    work.shards.append("rows-0", work.tile, (row, row, own.borders.area))
+    work.shards.append("borders-0", work.tile, (first + own.borders.pairs, own.borders.length))
+    same = [np.empty((0, 2), np.int64)]
+    i, j = work.tile
+    for side, opposite, tile in ((EAST, WEST, (i + 1, j)), (NORTH, SOUTH, (i, j + 1))):
+        if (second := numbers.first(tile)) < 0:
+            continue
+        (other,) = work.shards.read("sides", tile)
+        for barrier in (False, True):
+            met, shared = match_sides(_side(own, side, barrier), _side(other, opposite, barrier))
+            open_to = (not barrier) & (shared > APART) & (own.block[met[:, 0]] == other.block[met[:, 1]])
+            met += np.array([first, second])
+            same.append(met[open_to])
+            work.shards.append("borders-0", work.tile, (met[~open_to], shared[~open_to]))
+    return np.concatenate(same)
+
+
+def _side(pieces: Pieces, side: int, barrier: bool) -> tuple[Index, NDArray[np.float64], NDArray[np.float64]]:
+    own = pieces.borders
+    rows = (own.side == side) & (own.barrier == barrier)
+    return own.piece[rows], own.low[rows], own.high[rows]
 
 
 def register(outlines: NDArray[np.object_], pieces: NDArray[np.object_]) -> Index:
@@ -106,13 +167,14 @@ def register(outlines: NDArray[np.object_], pieces: NDArray[np.object_]) -> Inde
 def _read_near(work: Work, box: tuple[float, float, float, float]) -> tuple[NDArray[np.object_], Index]:
     """Read the buildings in and around a tile, and the block of each."""
     area = shapely.box(*_grow(box, REACH))
-    parts, names = [], []
+    parts, names = [], [np.empty(0, np.int64)]
     for tile in around(work.tile):
         outlines = read_buildings(work.shards, tile).outlines
         kept = shapely.intersects(outlines, area)
         parts.append(outlines[kept])
         blocks = work.shards.read("blocks", tile)
-        names.append(blocks[0][kept] if blocks else np.empty(0, np.int64))
+        if blocks:
+            names.append(blocks[0][1][work.shards.read("chains", tile)[0]][kept])
     return np.concatenate(parts), np.concatenate(names)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import shapely
@@ -12,9 +13,10 @@ from pipeline.generalisation.aggregation import areas_of, find_adjacent, merge_o
 from pipeline.generalisation.barriers import GRID
 from pipeline.generalisation.blocks import cut_block, is_building, keep_near, mean_heights, subtract
 from tiler.generalisation.buildings import Buildings, join_buildings
+from tiler.generalisation.region_cells import read_rows
 from tiler.generalisation.rows import CellRows, Rows, join_rows
 from tiler.generalisation.shards import Tile, by_tile
-from tiler.generalisation.tile_cells import Work, read_buildings
+from tiler.generalisation.tile_cells import Work, read_buildings, read_numbers
 from tiler.vectors.features import to_objects
 
 Array = NDArray[np.float64]
@@ -56,37 +58,13 @@ class OwnCells:
     cell: Index
 
 
-@dataclass(frozen=True, eq=False)
-class CellRecord:
-    """What the driver needs to know of the cells of a tile."""
-
-    number: Index
-    id: Texts
-    use: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class GroupList:
-    """What LoD0A has in a tile.
-
-    `parent` is the object of each own cell, ``""`` for none; `id` are the objects that the tile owns, and row by
-    row `group` says of which of them a `cell` is, by its number, which `tile` owns.
-    """
-
-    parent: Texts
-    id: Texts
-    group: Index
-    cell: Index
-    tile: Index
-
-
-def make_cells(work: Work) -> CellRecord:
-    """Make the cells that a tile owns: outlines, land use, LoD0C."""
-    (listed,) = work.shards.read("cells", work.tile)
-    found = _gather(work, listed)
+def make_cells(work: Work) -> None:
+    """Make the cells that a tile owns: outlines, land use, LoD0C; they go into files."""
+    cell, number, _ = read_rows(work.shards, 2, work.tile)
+    found = _gather(work, CellList(np.unique(cell), cell, *read_numbers(work.shards, "pieces").places(number)))
     work.shards.append("made", work.tile, found)
+    work.shards.append("use", work.tile, (found.id, found.use))
     _list_standing(work, found)
-    return CellRecord(found.number, found.id, found.use)
 
 
 def _gather(work: Work, listed: CellList) -> OwnCells:
@@ -175,23 +153,14 @@ def _list_standing(work: Work, found: OwnCells) -> None:
 def make_levels(work: Work) -> None:
     """Make the rows of all levels of a tile, and of its cells; they go into a file."""
     (own,) = work.shards.read("made", work.tile)
-    (groups,) = work.shards.read("groups", work.tile)
     is_block = own.use[own.cell] & (own.lod0c.landmark == 0)
     lod0c = replace(own.lod0c, parent=np.where(is_block, own.lod0c.cell, own.lod0c.id))
     alone = replace(own.lod0c, parent=own.lod0c.id).take(~is_block)
+    parent = _name_parents(work, own.use)
     used = np.flatnonzero(own.use)
-    blocks = [_block(work, [(own, k)], own.id[k], groups.parent[k]) for k in used.tolist()]
-    cells = {tile: work.shards.read("made", tile)[0] for tile, _ in by_tile(groups.tile)}
-    upper, groups_of = [], {}
-    for k, name in enumerate(groups.id.tolist()):
-        mine = [
-            (cells[tuple(tile)], int(np.searchsorted(cells[tuple(tile)].number, number)))
-            for tile, number in zip(
-                groups.tile[groups.group == k].tolist(), groups.cell[groups.group == k].tolist(), strict=True
-            )
-        ]
-        groups_of[name] = mine
-        upper.append(_block(work, mine, name, ""))
+    blocks = [_block(work, [(own, k)], own.id[k], parent[k]) for k in used.tolist()]
+    groups_of = _read_groups(work)
+    upper = [_block(work, mine, name, "") for name, mine in groups_of.items()]
     rows = {
         "lod1": _lod1(own),
         "lod0c": lod0c,
@@ -199,9 +168,32 @@ def make_levels(work: Work) -> None:
         "lod0a": join_rows([*upper, replace(alone, parent=to_objects([""] * len(alone)))]),
     }
     count = np.bincount(own.owner, minlength=len(own.id))
-    cells_of = CellRows(own.outlines, own.id, own.use, own.free, own.built, count, groups.parent)
+    cells_of = CellRows(own.outlines, own.id, own.use, own.free, own.built, count, parent)
     children = {name: [own.id[k] for own, k in mine] for name, mine in groups_of.items()}
     work.shards.append("rows", work.tile, (cells_of, rows, children))
+
+
+def _name_parents(work: Work, use: NDArray[np.bool_]) -> Texts:
+    """Give the object of LoD0A of each cell of a tile, by the first cell in it; ``""`` for cells of other use."""
+    _, group = work.shards.read("names-2", work.tile)[0]
+    parent = np.full(len(group), "", object)
+    for tile, rows in by_tile(read_numbers(work.shards, "pieces").places(group)[0]):
+        number, ids = work.shards.read("names-2", tile)[0][0], work.shards.read("use", tile)[0][0]
+        parent[rows] = ["A" + name[1:] for name in ids[np.searchsorted(number, group[rows])].tolist()]
+    return np.where(use, parent, "")
+
+
+def _read_groups(work: Work) -> dict[str, list[tuple[OwnCells, int]]]:
+    """Read the cells of each object of LoD0A that a tile owns, by its id: cells of a tile, and the row of one."""
+    made = cache(lambda tile: work.shards.read("made", tile)[0])
+    numbers, found = read_numbers(work.shards, "pieces"), {}
+    group, cell = np.concatenate([np.empty((2, 0), np.int64), *work.shards.read("groups", work.tile)], axis=1)
+    for name in np.unique(group).tolist():
+        mine = np.sort(cell[group == name])
+        cells = [made(tuple(tile)) for tile in numbers.places(mine)[0].tolist()]
+        rows = [int(np.searchsorted(one.number, k)) for one, k in zip(cells, mine.tolist(), strict=True)]
+        found["A" + cells[0].id[rows[0]][1:]] = list(zip(cells, rows, strict=True))
+    return found
 
 
 def _lod1(own: OwnCells) -> Rows:

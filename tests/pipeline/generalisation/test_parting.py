@@ -1,12 +1,14 @@
 """Pieces of tiles and graphs of cells, by examples whose answers are found by hand."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import shapely
 
 from pipeline.generalisation.aggregation import find_adjacent, merge_outlines
 from pipeline.generalisation.barriers import deal_segments, explode_lines, split_at_grid
-from pipeline.generalisation.cell_graph import join_small
+from pipeline.generalisation.cell_graph import SmallCells
 from pipeline.generalisation.measures import count_faces
 from pipeline.generalisation.partition import EAST, find_borders, match_sides, partition_tile
 from pipeline.generalisation.street_axis import find_street_axis
@@ -44,19 +46,52 @@ def test_pieces_of_two_tiles_meet_along_what_both_have() -> None:
     assert len(match_sides(one, empty)[0]) == len(match_sides(empty, empty)[0]) == 0
 
 
+def join(area: Any, pairs: Any, length: Any, limit: float, *, step: int = 0, **how: bool) -> tuple[list[int], int]:
+    """Name of each cell, where so many are given at once, and the most in memory after that; NaN is no cell."""
+    graph, log, most = SmallCells(limit, **how), [], 0
+    for part in np.split(np.arange(len(area)), range(step, len(area), step) if step else []):
+        known, mine = part[~np.isnan(area[part])], np.isin(pairs[:, 0], part)
+        graph.add(known, area[known], pairs[mine], length[mine])
+        log += graph.join(int(part[-1]) + 1)
+        most = max(most, len(graph.size))
+    names: dict[int, int] = {}
+    for one, other in reversed(log):
+        names[one] = names.get(other, other)
+    return [names.get(k, k) for k in range(len(area))], most
+
+
 def test_fragments_go_to_the_longest_border_and_grow() -> None:
     area = np.array([3.0, 4, 50, 60])
-    pairs, length = np.array([[0, 1], [1, 2], [1, 3], [0, 3]]), np.array([5.0, 2, 1, 2])
+    pairs, length = np.array([[0, 1], [0, 3], [1, 2], [1, 3]]), np.array([5.0, 2, 2, 1])
     # 0 goes to 1, which then has the same border with 2 as 1 + 2 with 3: 3 is the longer one.
-    assert join_small(area, pairs, length, 10.0).tolist() == [0, 0, 2, 0]
-    assert join_small(area, pairs, length, 3.0).tolist() == [0, 1, 2, 3]  # not below the limit
+    assert join(area, pairs, length, 10.0)[0] == [0, 0, 2, 0]
+    assert join(area, pairs, length, 3.0)[0] == [0, 1, 2, 3]  # not below the limit
 
 
 def test_cells_are_aggregated_up_to_a_limit_among_their_kind() -> None:
-    area, use = np.full(5, 10.0), np.array([True, True, True, False, True])
+    area = np.array([10.0, 10, 10, np.nan, 10])
     pairs, length = np.array([[0, 1], [1, 2], [2, 3], [3, 4]]), np.array([1.0, 2, 9, 9])
-    assert join_small(area, pairs, length, 10.0, among=use).tolist() == [0, 0, 2, 3, 4]
-    assert join_small(area, pairs, length, 20.0, among=use).tolist() == [0, 0, 0, 3, 4]
+    assert join(area, pairs, length, 10.0, alike=True)[0] == [0, 0, 2, 3, 4]
+    assert join(area, pairs, length, 20.0, alike=True)[0] == [0, 0, 0, 3, 4]
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_cells_by_columns_are_joined_as_those_of_the_whole_region(alike: bool) -> None:
+    """A grid of 12 by 60 cells with few different areas and borders, and a cell beside some columns."""
+    rng = np.random.default_rng(45)
+    k = np.arange(720).reshape(60, 12)
+    sides = (k[:-1], k[1:]), (k[:, :-1], k[:, 1:]), (np.full(20, 5), k[10:30, 7])
+    pairs = np.concatenate([np.column_stack((one.ravel(), other.ravel())) for one, other in sides])
+    for _ in range(3):
+        area, length = rng.integers(1, 9, 720).astype(float), rng.integers(1, 4, len(pairs)).astype(float)
+        if alike:
+            area[rng.random(720) < 0.2] = np.nan
+        whole, _ = join(area, pairs, length, 6.0, alike=alike)
+        assert len(set(whole)) < 600
+        for step in (12, 36, 100):
+            names, most = join(area, pairs, length, 6.0, step=step, alike=alike)
+            assert names == whole
+            assert most < 400
 
 
 def test_adjacent_buildings_of_a_cell_are_one_and_a_gap_is_closed() -> None:
