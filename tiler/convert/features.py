@@ -4,18 +4,20 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.cityinput.faces import DOOR, GROUND, NO_LOD, ROOF, WALL, WINDOW, Faces, ModelBuilding, Shape
+from pipeline.facades.pictures import Picture
+from tiler.cityinput.faces import DOOR, GROUND, NO_LOD, PICTURED, ROOF, WALL, WINDOW, Faces, ModelBuilding, Shape
 from tiler.convert.inputs import ModelSource
 
 SURFACES = {GROUND: "GroundSurface", ROOF: "RoofSurface", WALL: "WallSurface"}
 OPENINGS = {WINDOW: "Window", DOOR: "Door"}
+KINDS = {name: kind for kind, name in (SURFACES | OPENINGS).items()}
 WITHOUT_LEVEL = 2.0  # what geometries are taken for whose level is not stated
 
 Ring = list[int]
@@ -29,6 +31,7 @@ class Geometry:
     lod: float
     closed: bool
     faces: list[Face]
+    pictures: dict[int, Picture] = field(default_factory=dict)  # by the number of the face that shows each
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +77,9 @@ def iter_features(source: ModelSource) -> Iterator[Feature]:
         rows, number = np.unique(np.concatenate([np.empty((0, 3), np.int64), *units]), axis=0, return_inverse=True)
         ends = np.cumsum([0, *map(len, units)])
         geometries: dict[str, list[Geometry]] = {}
+        pictures = iter(building.pictures)
         for shape, (first, last) in zip(building.shapes, pairwise(ends), strict=True):
-            found = _make_geometry(shape, number.ravel()[first:last].tolist(), source.told)
+            found = _make_geometry(shape, number.ravel()[first:last].tolist(), source.told, pictures)
             if found is not None:
                 geometries.setdefault(shape.owner, []).append(found)
         objects = [
@@ -116,15 +120,24 @@ def unique_name(name: str, seen: Seen) -> str:
     return found
 
 
-def _make_geometry(shape: Shape, number: list[int], told: Counter[str]) -> Geometry | None:
-    faces = [each for each in rings_of(shape.faces, number) if each[1]]
+def _make_geometry(
+    shape: Shape, number: list[int], told: Counter[str], pictures: Iterator[Picture]
+) -> Geometry | None:
+    faces: list[Face] = []
+    shown = {}
+    for kind, rings in rings_of(shape.faces, number):
+        picture = next(pictures) if kind == PICTURED else None
+        if rings and picture is not None:
+            shown[len(faces)] = picture
+        if rings:
+            faces.append((kind if picture is None else KINDS[picture.kind], rings))
     told["faces without area"] += len(shape.faces) - len(faces)
     if not faces:
         return None
     told["geometries without a level, taken for level 2"] += shape.lod == NO_LOD
     told["geometries of several solids, written as surfaces"] += shape.several
     lod = WITHOUT_LEVEL if shape.lod == NO_LOD else shape.lod
-    return Geometry(lod, shape.closed and not shape.several and lod > 0, faces)
+    return Geometry(lod, shape.closed and not shape.several and lod > 0, faces, shown)
 
 
 def rings_of(faces: Faces, number: list[int]) -> Iterator[Face]:

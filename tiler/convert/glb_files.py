@@ -82,7 +82,7 @@ def write_glb(path: Path, source: ModelSource, lod: str, *, detailed: bool = Fal
         lists: dict[str, IO[bytes]] = {name: files[name] for name in LISTS}
         vertices, corners, on_pages, pages = (files[name] for name in parts)
         groups = [*GROUPS, *(DETAILS if detailed else ())]
-        own = Pages(_picture_colours(), pages)
+        own = Pages(picture_colours(), pages)
         buffers = _Buffers(groups, lists, vertices, corners, on_pages, own)
         origin = origin_of(source)
         for one in iter_triangles(source, lod):
@@ -147,7 +147,7 @@ def _add_pictures(buffers: _Buffers, one: SolidBuilding, corner: Array) -> Itera
         }
 
 
-def _picture_colours() -> dict[str, tuple[int, int, int]]:
+def picture_colours() -> dict[str, tuple[int, int, int]]:
     """Colours of materials, which are linear, as sRGB."""
     linear = {surfaces.WALL: COLOURS[Marker.WALL], BALCONY: DETAILS[INSTALLATION][1]}
     linear |= {surfaces.WINDOW: DETAILS[WINDOW][1], surfaces.DOOR: DETAILS[DOOR][1]}

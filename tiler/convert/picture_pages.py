@@ -1,4 +1,4 @@
-"""Pages of pictures for the textures of a GLB: squares that are filled row by row, and written as PNG."""
+"""Pages of pictures for textures of detailed models: squares filled row by row, written as PNG."""
 
 from dataclasses import dataclass, field
 from typing import IO

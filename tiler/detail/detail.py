@@ -5,19 +5,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from pipeline.data.errors import ConfigError
 from pipeline.facades.criteria import Criteria
 from pipeline.facades.graph import LABELS
 from tiler.cityinput.levels import CHOICES
-from tiler.convert.cityjson_files import write_document, write_sequence
+from tiler.convert.cityjson_files import page_name, write_document, write_sequence
 from tiler.convert.convert import refuse_output
-from tiler.convert.glb_files import write_glb
+from tiler.convert.glb_files import picture_colours, write_glb
 from tiler.convert.inputs import open_source
+from tiler.convert.picture_pages import Pages
 from tiler.detail.detailed_source import DetailedSource, detail_source
 from tiler.detail.rule_files import load_graph
 from tiler.detail.table import make_table, table_lines
-from tiler.store.atomic import replacing
+from tiler.store.atomic import replacing, replacing_folder
 
 SUFFIXES = (".glb", ".json", ".jsonl")
 
@@ -48,7 +50,8 @@ def detail_models(inputs: Sequence[Path], output: Path, asked: DetailAsked) -> l
     inputs : sequence of Path
         As of `tiler.convert.convert.convert_models`.
     output : Path
-        A file ``.glb``, ``.json`` (CityJSON) or ``.jsonl`` (CityJSONSeq); it appears whole or not at all.
+        A file ``.glb``, ``.json`` (CityJSON) or ``.jsonl`` (CityJSONSeq); it appears whole or not at all. Textures
+        of CityJSON are in the folder ``NAME-pictures`` beside it.
     asked : DetailAsked
         What is asked.
 
@@ -66,17 +69,21 @@ def detail_models(inputs: Sequence[Path], output: Path, asked: DetailAsked) -> l
     if asked.lod not in CHOICES:
         raise ConfigError(f"lod {asked.lod!r}: must be one of {', '.join(CHOICES)}")
     refuse_output(output, inputs, overwrite=asked.overwrite)
+    pictures = output.with_name(f"{output.name.removesuffix(output.suffix).removesuffix('.city')}-pictures")
+    if output.suffix != ".glb":
+        refuse_output(pictures, inputs, overwrite=asked.overwrite and _holds_pages(pictures))
     if asked.json_file is not None:
         refuse_output(asked.json_file, [*inputs, output], overwrite=asked.overwrite)
     graph, criteria = load_graph(asked.rules), make_criteria(asked)
     with open_source(inputs, crs=asked.crs, axis_order=asked.axis_order) as plain:
         if plain.in_degrees:
             raise ConfigError("coordinates are degrees, and rules in metres; give --crs EPSG:NNNN")
-        source = detail_source(
-            plain, graph, tuple(criteria.values()), lod=asked.lod, pictured=output.suffix == ".glb"
-        )
+        source = detail_source(plain, graph, tuple(criteria.values()), lod=asked.lod)
         with replacing(output) as part:
-            _write(part, output.suffix, source)
+            if output.suffix == ".glb":
+                write_glb(part, source, "auto", detailed=True)
+            else:
+                _write_cityjson(part, output.suffix, source, pictures)
         table = make_table(source.counts, tuple(criteria))
         if asked.json_file is not None:
             with replacing(asked.json_file) as part:
@@ -85,13 +92,21 @@ def detail_models(inputs: Sequence[Path], output: Path, asked: DetailAsked) -> l
         return [*source.notes, *told, *table_lines(table)]
 
 
-def _write(path: Path, suffix: str, source: DetailedSource) -> None:
-    if suffix == ".glb":
-        write_glb(path, source, "auto", detailed=True)
-    elif suffix == ".json":
-        write_document(path, source)
-    else:
-        write_sequence(path, source)
+def _holds_pages(folder: Path) -> bool:
+    return folder.is_dir() and all(path.suffix == ".png" for path in folder.iterdir())
+
+
+def _write_cityjson(path: Path, suffix: str, source: DetailedSource, pictures: Path) -> None:
+    """Write CityJSON or CityJSONSeq, and the pages of its textures, if there are any, in a folder beside it."""
+    with TemporaryFile() as file:
+        pages = Pages(picture_colours(), file)
+        (write_document if suffix == ".json" else write_sequence)(path, source, pages, pictures.name)
+        pages.close()
+        file.seek(0)
+        if pages.sizes:
+            with replacing_folder(pictures) as folder:
+                for k, size in enumerate(pages.sizes):
+                    (folder / page_name(k)).write_bytes(file.read(size).rstrip(b"\0"))
 
 
 def make_criteria(asked: DetailAsked) -> dict[str, Criteria]:

@@ -68,7 +68,6 @@ class DetailedSource(ModelSource):
     # The first keeps everything, the second is what is made; others are counted alone.
     criteria: tuple[Criteria, ...]
     lod: str = "auto"  # which level buildings are taken at: see `tiler.cityinput.levels.CHOICES`
-    pictured: bool = False  # whether what is flat has pictures
     # Buildings, façades, assets, and polygons by criterion (``"polygons 0"`` and so on), ``"low assets"``, ``"low
     # facades"``; each reading counts anew.
     counts: Counter[str] = field(default_factory=Counter)
@@ -112,7 +111,7 @@ class DetailedSource(ModelSource):
                     continue
                 wall, products, found = made[k, j]
                 frame = wall.frame
-                shown = _find_pictures(wall, products, found) if self.pictured else {}
+                shown = _find_pictures(wall, products, found)
                 pictures += shown.values()
                 done.add([*rings, *_place(frame, [found.wall])[0]], PICTURED if -1 in shown else WALL)
                 for n, own in enumerate(_place(frame, found.surfaces)):
@@ -187,12 +186,13 @@ def _find_pictures(wall: Facade, products: list[Product], made: Made) -> dict[in
     """Give the pictures of the flat surfaces of a façade, by their number; of a plain wall with assets as -1."""
     if products and not made.surfaces:
         assets = [(one.insert, one.corner) for one in products]
-        return {-1: Picture(wall.frame, (wall.width, wall.height), assets)}
+        return {-1: Picture(wall.frame, (wall.width, wall.height), assets, surfaces.WALL)}
     corners = wall.frame.place(np.array([(u, 0.0, v) for _, (u, v) in made.flat.values()]).reshape(-1, 3))
-    return {
-        n: Picture(replace(wall.frame, origin=origin), (insert.width, insert.height), [(insert, (0.0, 0.0))])
-        for (n, (insert, _)), origin in zip(made.flat.items(), corners, strict=True)
-    }
+    found = {}
+    for (n, (insert, _)), origin in zip(made.flat.items(), corners, strict=True):
+        size, kind = (insert.width, insert.height), made.surfaces[n].kind
+        found[n] = Picture(replace(wall.frame, origin=origin), size, [(insert, (0.0, 0.0))], kind)
+    return found
 
 
 def detail_source(
@@ -201,14 +201,13 @@ def detail_source(
     criteria: tuple[Criteria, ...],
     *,
     lod: str = "auto",
-    pictured: bool = False,
 ) -> DetailedSource:
-    """Detail a source; its box grows by how far assets reach out of walls. `pictured`: flat ones get pictures."""
+    """Detail a source; its box grows by how far assets reach out of walls."""
     out = max((reach(node.insert)[0] for node in graph.nodes.values() if isinstance(node, InsertLod)), default=0.0)
     grown = np.array([out, out, 0.0])
     return DetailedSource(
         source.files, source.crs, source.low - grown, source.high + grown, source.notes, Counter(),
-        graph, criteria, lod, pictured,
+        graph, criteria, lod,
     )  # fmt: skip
 
 

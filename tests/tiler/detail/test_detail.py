@@ -108,7 +108,7 @@ def test_a_viewpoint_keeps_what_is_near_and_faces_it(house: Path) -> None:
     }
     other, rules = house.parent / "b.city.jsonl", str(house.parent / "rules.json")
     lines = tiler.detail_models(house, other, rules=rules, **words)
-    assert other.read_bytes() == path.read_bytes()
+    assert other.read_text().replace("b-pictures", "a-pictures") == path.read_text()
     assert lines[-3].startswith("semantics alone")
     told = json.loads(table.read_text())
     names = [row["model"] for row in told["polygons"]]
@@ -139,8 +139,15 @@ def test_a_glb_has_materials_for_openings(house: Path) -> None:
 def test_flat_facades_and_assets_of_a_glb_show_pictures_of_their_assets(house: Path) -> None:
     whole = detail(house, "a.glb", "--viewpoint", "0,0,0")
     single = detail(house, "b.glb", "--viewpoint", "0,0,0", "--keep", "balcony=100")  # the wall has a balcony
-    for path, names in ((whole, ("wall", "window", "door")), (single, ("window", "door"))):
-        page, xyz, uv = read_pictures(path)
+    model = detail(house, "d.city.json", "--viewpoint", "0,0,0")
+    assets = detail(house, "e.city.jsonl", "--viewpoint", "0,0,0", "--keep", "balcony=100")
+    for path, names in (
+        (whole, ("wall", "window", "door")),
+        (single, ("window", "door")),
+        (model, ("wall", "window", "door")),
+        (assets, ("window", "door")),
+    ):
+        page, xyz, uv = read_pictures(path) if path.suffix == ".glb" else read_textures(path)
         # On the front, from its lower left corner on: x and y (m).
         for name in names:
             x, y = {"wall": (0.3, 0.5), "window": (2.0, 1.5), "door": (5.5, 1.0)}[name]
@@ -153,6 +160,44 @@ def test_flat_facades_and_assets_of_a_glb_show_pictures_of_their_assets(house: P
             (red, _, blue) = found[0]
             assert {"wall": red > 220, "window": blue > red + 15, "door": red > blue + 30}[name], (path, name)
     assert detail(house, "c.glb", "--viewpoint", "0,0,0").read_bytes() == whole.read_bytes()
+    before = model.read_bytes(), (house.parent / "d-pictures" / "1.png").read_bytes()
+    again = detail(house, "d.city.json", "--viewpoint", "0,0,0", "--overwrite")
+    assert (again.read_bytes(), (house.parent / "d-pictures" / "1.png").read_bytes()) == before
+    (house.parent / "d-pictures" / "mine.txt").touch()  # a folder with other files is not replaced
+    assert main(["detail", str(house), "-o", str(model), "--viewpoint", "0,0,0", "--overwrite"]) == 2
+
+
+def read_textures(path: Path) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Read the page of CityJSON, and triangles of the faces that show it, as `read_pictures` does."""
+    document, *features = map(
+        json.loads, path.read_text().split("\n", 1) if path.suffix == ".jsonl" else [path.read_text()]
+    )
+    one = features[0] if features else document
+    if SCHEMA.is_file():
+        name = "cityjsonfeature" if features else "cityjson"
+        jsonschema.Draft7Validator(json.loads((SCHEMA.parent / f"{name}.min.schema.json").read_text())).validate(
+            one
+        )
+    (texture,) = one["appearance"]["textures"]
+    page = np.asarray(Image.open(path.parent / texture["image"]), np.int64)
+    xyz = np.array(one["vertices"]) * document["transform"]["scale"]
+    xyz = (xyz - xyz.min(axis=0))[:, [0, 2, 1]] * [1, 1, -1]
+    uv = np.array(one["appearance"]["vertices-texture"]) * [1, -1] + [0, 1]
+    solid = one["CityObjects"]["house"]["geometry"][0]
+    found = []
+    for face, shown in zip(solid["boundaries"][0], solid["texture"]["facades"]["values"][0], strict=True):
+        if shown != [[None]]:
+            assert (len(face), shown[0][0], len(shown[0])) == (1, 0, len(face[0]) + 1)
+            found += [
+                (
+                    (xyz[face[0][0]], xyz[face[0][k]], xyz[face[0][k + 1]]),
+                    (uv[shown[0][1]], uv[shown[0][k + 1]], uv[shown[0][k + 2]]),
+                )
+                for k in range(1, len(face[0]) - 1)
+            ]
+    corners, places = (np.array(part) for part in zip(*found, strict=True))
+    corners[:, :, 2] -= corners[:, :, 2].max() - 1
+    return page, corners, places
 
 
 def read_pictures(path: Path) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
