@@ -358,9 +358,9 @@ def load_air(
             continue
         city = rim.vertex[rim.boundary.facets[np.isin(rim.boundary.marker, SHOWN)]]
         faces = find_outer_faces(piece.mesh.points, piece.mesh.cells[north], city)
-        used, rows = np.unique(faces, return_inverse=True)
+        used, rows = _number(faces, len(piece.mesh.points))
         points.append(piece.mesh.points[used] - origin)
-        corners.append(rows.reshape(-1, 3) + n_points)
+        corners.append(rows + n_points)
         n_points += len(used)
     if not n_points and within < np.inf:
         return load_air(directory, origin, only=only)
@@ -460,15 +460,22 @@ def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
     """Take ground, walls and roofs, with the quality of the cells of a volume piece behind them."""
     boundary = piece.boundary
     shown = np.isin(boundary.marker, SHOWN)
-    used, corners = np.unique(boundary.facets[shown], return_inverse=True)
+    used, corners = _number(boundary.facets[shown], len(piece.points))
     ratio = np.full(len(shown), np.nan, np.float32)
     if volume is not None:
         ratio = measure_facets(read_vtu(volume).mesh, piece)
     return Facets(
         piece.points[used],
-        corners.reshape(-1, 3).astype(np.int64, copy=False),
+        corners,
         boundary.marker[shown],
-        np.full(len(corners.reshape(-1, 3)), row, np.int32),
+        np.full(len(corners), row, np.int32),
         boundary.building[shown],
         ratio[shown],
     )
+
+
+def _number(rows: NDArray[Any], n_points: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Points that rows (k, 3) use, in their order, and the rows in numbers of these."""
+    used = np.zeros(n_points, np.bool_)
+    used[rows] = True
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[rows]

@@ -44,7 +44,7 @@ OCCLUSION_RADIUS = 20.0
 MOST_SHADED = 10_000.0  # m; in a larger region a house is below a pixel, and the shade is of the terrain's slope
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
-STRIP = 128  # rows of pixels drawn that are kept of those drawn at a time
+AT_ONCE = 600_000  # pixels of a picture that are drawn at a time, or as many as darken each other
 BLURRED = 4
 SHADE = 16  # places around each pixel drawn that may darken it
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
@@ -224,7 +224,9 @@ def draw_city(
     # The legend of quality gives the colours as they are.
     dark = max(OCCLUSION_RADIUS, extent / 100) if extent < MOST_SHADED and colours != "quality" else 0.0
     beside = SAMPLES * math.ceil(dark / extent * zoom * size[0])
-    with _plotter(size, rows=None if colours == "quality" else 2 * beside + max(STRIP, 2 * beside)) as plotter:
+    rows = max(SAMPLES * (AT_ONCE // SAMPLES**2 // size[0]), 4 * beside)
+    whole = colours == "quality" or rows > size[1] * SAMPLES / 2
+    with _plotter(size, rows=None if whole else rows) as plotter:
         full = round(size[0] * zoom), round(size[1] * zoom)  # pixels that all of it would have
         shown = add_city(plotter, city, full, colours=colours, edges=edges)
         if air is not None:
