@@ -174,7 +174,7 @@ def coarse_terrain(sums: CoarseSums) -> Dtm:
     if not sums.n_known:
         raise InputError(
             f"terrain, step 1.3: none of the {window.nx * window.ny} nodes has a ground point (class 2 or 9); "
-            "check the bounds and the classes of the point cloud, or ask for --ground-filter"
+            "check the bounds and the classes of the point cloud, or give --ground-filter or --terrain"
         )
     i0, j0 = window.i0 // COARSE, window.j0 // COARSE
     nx = -(-(window.i0 + window.nx - 1) // COARSE) - i0 + 1

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from tiler.cityinput.faces import NO_LOD, OUTLINE, ROOF, UNKNOWN, Faces, ModelBuilding, Shape, join_faces
+from tiler.cityinput.faces import GROUND, NO_LOD, OUTLINE, ROOF, UNKNOWN, Faces, ModelBuilding, Shape, join_faces
 
 ROOFS = 2.0  # from this level on, roofs have their shapes
 OPENINGS = 3.0  # from this level on, surfaces have openings and details
@@ -66,9 +66,11 @@ def _choose_shapes(building: ModelBuilding, asked: str) -> Iterator[tuple[float,
 
 
 def find_outline(building: ModelBuilding) -> Faces:
-    """Give the polygons that say where a building stands alone: those of the level 0."""
+    """Give faces that say where a building without roofs stands: those of the level 0, else with the ground's."""
     found = join_faces(shape.faces for shape in building.shapes if 0 <= shape.lod < 1)
-    return found if (found.kind == OUTLINE).all() else join_faces([])
+    if len(found) and (found.kind == OUTLINE).all():
+        return found
+    return join_faces(shape.faces for shape in building.shapes if (shape.faces.kind == GROUND).any())
 
 
 def _of_one_kind(shapes: list[Shape]) -> list[Shape]:

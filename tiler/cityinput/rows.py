@@ -14,7 +14,7 @@ from pipeline.data.citymodel import make_ids
 from pipeline.data.notes import Note
 from pipeline.data.roofs import Roofs, join_roofs, take_roofs
 from tiler.cityinput.face_planes import FacePlanes, find_planes
-from tiler.cityinput.faces import GROUND, ROOF, WALL, Faces, ModelBuilding, join_faces
+from tiler.cityinput.faces import GROUND, OUTLINE, ROOF, WALL, Faces, ModelBuilding, join_faces
 from tiler.cityinput.levels import find_outline, list_attempts
 from tiler.georeference.frame import Frame, to_region
 
@@ -226,7 +226,8 @@ def _find_outlines(tries: Sequence[tuple[int, float, Faces]], placing: Placing) 
     found = {}
     for k, _, faces in tries:
         placed = _to_region(faces, placing)
-        outline = _areas_of(shapely.union_all(_make_polygons(placed, np.arange(len(placed)))))
+        lying = np.flatnonzero(np.isin(faces.kind, (OUTLINE, GROUND)))
+        outline = _areas_of(shapely.union_all(_make_polygons(placed, lying)))
         if not outline.is_empty:
             found[k] = outline
     return found

@@ -151,9 +151,10 @@ def describe_others(headers: Sequence[CloudHeader], config: Config) -> tuple[lis
         files = "1 city model" if len(models) == 1 else f"{len(models)} city models"
         words.append(f"{n} {'building' if n == 1 else 'buildings'} in {files}")
     if models and config.keeps_model_roofs:
+        finer = f", {config.finer_clearance:g} m where roofs would be off" if config.finer_clearance else ""
         words.append(
-            f"walls keep {config.clearance:g} m from each other (--clearance): more makes fewer cells, and moves "
-            "walls of the model by up to as much"
+            f"walls keep {config.clearance:g} m from each other (--clearance){finer}: more makes fewer cells, and "
+            "moves walls of the model by up to as much"
         )
     for one in models:
         if one.axes:

@@ -129,12 +129,18 @@ def test_without_a_roof_at_the_best_level_a_lower_one_counts_and_is_told(tmp_pat
     assert counts["model buildings at a lower level"] == 1
 
 
-def test_an_outline_alone_leaves_the_height_to_the_attribute(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["level 0", "ground and walls"])
+def test_an_outline_alone_leaves_the_height_to_the_attribute(tmp_path: Path, kind: str) -> None:
     document = several_levels()
     house = document["CityObjects"]["house"]
-    house["geometry"], house["attributes"] = house["geometry"][-1:], {"measuredHeight": 7.5}
+    whole, *_, outline = house["geometry"]
+    chosen = np.flatnonzero(np.array(whole["semantics"]["values"][0]) != 1).tolist()
+    whole["boundaries"] = [[whole["boundaries"][0][k] for k in chosen]]
+    whole["semantics"]["values"] = [[whole["semantics"]["values"][0][k] for k in chosen]]
+    house["geometry"], house["attributes"] = [outline if kind == "level 0" else whole], {"measuredHeight": 7.5}
     rows, notes, _ = rows_of(write_json(tmp_path / "a.json", document))
     assert (rows.start.tolist(), rows.given_height.tolist()) == ([0, 0], [7.5])
+    assert shapely.area(rows.outlines).tolist() == pytest.approx([80.0])
     assert notes == ["model-no-roof house: no level has a roof; its height of 7.5 m is taken over its outline"]
 
 

@@ -66,8 +66,10 @@ def test_walls_of_a_city_model_have_a_clearance_of_their_own() -> None:
         {"pointcloud": ["a.laz"], "prefer": "points"},
         {"clearance": 1.0},
     )
-    assert make_config(model).clearance == 0.5
+    assert (make_config(model).clearance, make_config(model).finer_clearance) == (0.5, 0.3)
+    assert make_config(model | {"finer_clearance": 0.0}).finer_clearance == 0
     assert [make_config(model | one).clearance for one in other] == [1.0] * 4
+    assert [make_config(model | one).finer_clearance for one in other] == [0.0] * 4
     assert make_config({"footprints": "a.gpkg"}).clearance == 1.0
 
 
@@ -84,6 +86,7 @@ def test_walls_of_a_city_model_have_a_clearance_of_their_own() -> None:
         ({"mesh_size": "10"}, "mesh_size = '10': float expected, not str"),
         ({"bounds": (0.0, 1.0)}, "four finite numbers"),
         ({"bounds": (0.0, 0.0, 5.0, 90.0)}, "smaller than one cell"),
+        ({"finer_clearance": 2.0}, "finer_clearance = 2 m: must be at most clearance = 1 m"),
         ({"clearance_floor": 2.0}, "clearance_floor = 2 m: must be at most clearance = 1 m"),
         ({"layer_height": 60.0, "mesher": "layered"}, "layer height 60 m: at most half of domain_height"),
         ({"mesh_size": 100.0}, "vertical spacing of up to 80 m .*: at most half of domain_height = 100 m"),
