@@ -193,7 +193,7 @@ def _cell_rows(survey: CfdSurvey) -> list[CfdRow]:
             f"{cells:.1f} median, {(sides >= CELLS_A_SIDE).mean():.0%} have them" if len(sides) else "none",
             (f">= {CELLS_A_SIDE:g}", f">= {CELLS_A_SIDE:g}"),
             (enough, enough),
-            f"a --mesh-size of {cells / CELLS_A_SIDE:.2f} times the present one",
+            f"a --wall-size, else --mesh-size, of {cells / CELLS_A_SIDE:.2f} times the present one",
         ),
         CfdRow(
             f"cells below {PEDESTRIAN_HEIGHT} m",
