@@ -37,7 +37,9 @@ def known_attribute(info: Layer, asked: str, known: Collection[str]) -> str:
     if asked and asked not in known:
         if info.n_features == 0:
             return ""
-        raise ConfigError(f"{info.path}: has no attribute {asked!r}; it has: {list_some(info.fields)}")
+        raise ConfigError(
+            f"{info.path}: has no attribute {asked!r}; it has: {list_some(info.fields)}; name one of these"
+        )
     return asked
 
 
