@@ -127,10 +127,11 @@ def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path:
     assert faults_of_sizes(out, found) == set()
     # A zone elsewhere, and one with smaller cells than it has, are found.
     shifted = shapely.to_wkb(shapely.box(*BOUNDS[:2], BOUNDS[0] + 40, BOUNDS[3]), hex=True)
-    assert faults_of_sizes(out, replace(found, zones=(("2.2", 3.5, shifted), *zones))) == {"zone-too-coarse"}
-    assert faults_of_sizes(out, replace(found, zones=(("2.2", 2.5, zones[0][2]), *zones[1:]))) == {
-        "zone-too-coarse"
-    }
+    both = {"zone-too-coarse", "zone-too-tall"}
+    assert faults_of_sizes(out, replace(found, zones=(("2.2", 3.5, shifted), *zones))) == both
+    assert faults_of_sizes(out, replace(found, zones=(("2.2", 2.5, zones[0][2]), *zones[1:]))) == both
+    assert faults_of_sizes(out, found, stretched=1.5) == {"zone-too-tall"}
+    assert faults_of_sizes(out, found, stretched=0.4) == {"zone-too-low"}
     for was, now, kind in (
         (f'"{LOD}":"1.2"', f'"{LOD}":"1.3"', "level-of-zone"),
         (f'"{LOD}":"2.2"', f'"{LOD}":"1.2"', "level-parts"),
@@ -143,12 +144,13 @@ def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path:
         assert kind in prove_levels(text.replace(was, now), zones, out, tmp_path)
 
 
-def faults_of_sizes(out: Path, record: RunRecord) -> set[str]:
-    """Faults of the sizes of zones in the pieces of a run."""
+def faults_of_sizes(out: Path, record: RunRecord, stretched: float = 1.0) -> set[str]:
+    """Faults of the sizes of zones in the pieces of a run, as if vertical edges were longer."""
     found = Finding()
     for path in sorted((out / "mesh").iterdir()):
-        piece = read_piece(path, out / "boundary" / f"{path.stem}.vtp", record.bounds)
-        one = check_sizes_of_zones(piece.surface, piece.outline, zone_finer(record), record)
+        piece = read_piece(path, out / "boundary" / f"{path.stem}.vtp", record.bounds, upright=True)
+        upright = piece.upright * [1, 1, stretched, stretched]
+        one = check_sizes_of_zones(piece.surface, piece.outline, upright, zone_finer(record), record)
         found = join_findings(found, one)
     return {fault.kind for fault in prove_sizes_of_zones(found).faults}
 
@@ -172,7 +174,7 @@ def test_triangles_on_open_ground_are_no_finer_than_their_zone_asks() -> None:
         asked = SizesAsked(mesh_size, mesh_size, 1.2, alone=True)
         zones = (("2.2", size, shapely.to_wkb(shapely.box(30, 30, 70, 70), hex=True)), ("1.2", mesh_size, ""))
         record = RunRecord("done", (0, 0, 100, 100), 0.0, {}, zones=zones, sizes=asked)
-        found = check_sizes_of_zones(surface, outline, zone_finer(record), record)
+        found = check_sizes_of_zones(surface, outline, np.empty((0, 4)), zone_finer(record), record)
         assert {fault.kind for fault in found.faults} == kinds, size
 
 

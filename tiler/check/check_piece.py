@@ -67,6 +67,8 @@ class Piece:
         What it alone says of the leaves in its cells.
     faults : tuple of Fault
         Of its cells.
+    upright : float64, (c, 4)
+        Place of each column of the air, and its shortest and longest vertical edge (m); none unless asked for.
     patch : int8, (k,), or None
         Patch of the ground of each facet of the surface; None where the file tells of none.
     """
@@ -88,6 +90,7 @@ class Piece:
     crowded: Vertices
     leaves: Finding
     faults: tuple[Fault, ...]
+    upright: NDArray[np.float64]
     patch: NDArray[np.int8] | None
 
 
@@ -113,8 +116,8 @@ class _Cells:
         Part of the mesh behind each exterior face.
     part_cells, part_air
         As of `Piece`.
-    leaves : Finding
-        What was found of leaves.
+    leaves, upright
+        As of `Piece`.
     faults : tuple of Fault
         Of cells and faces.
     """
@@ -131,6 +134,7 @@ class _Cells:
     part_cells: NDArray[np.int64]
     part_air: Mask
     leaves: Finding
+    upright: NDArray[np.float64]
     faults: tuple[Fault, ...]
 
 
@@ -141,6 +145,7 @@ def read_piece(
     *,
     regions: Regions = (Region.AIR,),
     density_at: DensityAt | None = None,
+    upright: bool = False,
 ) -> Piece:
     """Read the two files of a piece of the region with these bounds (m), each once.
 
@@ -154,13 +159,15 @@ def read_piece(
         What the mesh has.
     density_at : callable, optional
         Gives the leaf area density of places, where the mesh has trees.
+    upright : bool
+        Whether vertical edges are measured.
 
     Raises
     ------
     InputError
         If one is missing or damaged.
     """
-    cells = _survey_cells(volume_path, regions, density_at=density_at)
+    cells = _survey_cells(volume_path, regions, density_at=density_at, upright=upright)
     file = read_vtp(boundary_path)
     surface, rows = _join(cells.points, np.concatenate((cells.exterior, *cells.between.values())), file)
     counts = [len(cells.exterior), *(len(some) for some in cells.between.values())]
@@ -210,6 +217,7 @@ def read_piece(
                 *proofs.find_face_faults(surface.points, joined),
             ]
         ),
+        upright=cells.upright,
         patch=file.cell_data.get(PATCH_OF_GROUND),
     )
 
@@ -239,7 +247,7 @@ def _check_interfaces(
     return found, np.concatenate(on_seam)
 
 
-def _survey_cells(path: Path, regions: Regions, *, density_at: DensityAt | None) -> _Cells:
+def _survey_cells(path: Path, regions: Regions, *, density_at: DensityAt | None, upright: bool) -> _Cells:
     """Read the volume, and let its cells go."""
     volume = read_vtu(path)
     mesh = volume.mesh
@@ -268,8 +276,25 @@ def _survey_cells(path: Path, regions: Regions, *, density_at: DensityAt | None)
         part_cells=_count_parts(label),
         part_air=_count_parts(label[region == Region.AIR], int(label.max(initial=-1)) + 1) > 0,
         leaves=leaves,
+        upright=_measure_columns(mesh, region) if upright else np.empty((0, 4)),
         faults=proofs.merge_faults([*proofs.find_face_faults(mesh.points, pairs), *sizes.faults]),
     )
+
+
+def _measure_columns(mesh: TetMesh, region: NDArray[np.int8]) -> NDArray[np.float64]:
+    """Give place, shortest and longest vertical edge of each column of the air (c, 4)."""
+    places, column = np.unique(mesh.points[:, :2], axis=0, return_inverse=True)
+    column = column.ravel()
+    least, most = np.full(len(places), np.inf), np.zeros(len(places))
+    for start in range(0, len(mesh.cells), proofs.CELLS_AT_ONCE):
+        rows = slice(start, start + proofs.CELLS_AT_ONCE)
+        low, high = mesh.cells[rows][region[rows] == Region.AIR][:, [0, 3]].T
+        low, high = low[upright := column[low] == column[high]], high[upright]
+        length = np.abs(mesh.points[high, 2] - mesh.points[low, 2])
+        np.minimum.at(least, column[low], length)
+        np.maximum.at(most, column[low], length)
+    found: NDArray[np.float64] = np.column_stack((places, least, most))[most > 0]
+    return found
 
 
 def take_vertices(piece: Piece, marker: Marker) -> Vertices:

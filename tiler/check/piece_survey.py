@@ -116,6 +116,7 @@ def survey_piece(task: PieceTask) -> None:
         record.bounds,
         regions=record.regions,
         density_at=run.canopy,
+        upright=bool(record.zones),
     )
     with open_index(task.shared) as index:
         survey = _survey(piece, run, index)
@@ -206,7 +207,7 @@ def _survey(piece: Piece, run: Run, index: BuildingIndex) -> Survey:
     if run.canopy is not None:
         found["leaves"] = piece.leaves
     if record.zones:
-        found["zones"] = check_sizes_of_zones(surface, piece.outline, run.finer, record)
+        found["zones"] = check_sizes_of_zones(surface, piece.outline, piece.upright, run.finer, record)
     return Survey(
         found=found,
         rows=rows,

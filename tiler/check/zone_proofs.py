@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pipeline.data.mesh import Marker
 from pipeline.data.roof_forms import find_blocks
 from pipeline.plane_mesh.sizes import Finer, finer_sizes
-from tiler.check.proofs import Dtm, Fault, Finding, Proof, Surface, Vertices, find_faults
+from tiler.check.proofs import Dtm, Fault, Finding, Proof, Surface, Vertices, find_faults, join_findings
 from tiler.citymodels.building_index import BuildingRow, copy_vertices, has_parts, read_building, read_objects
 from tiler.config.step_options import make_finer
 from tiler.config.zone_levels import find_levels
@@ -35,6 +35,8 @@ BLOCK_ROWS, BATCH = "blocks", 10_000  # stage with the blocks that a run was giv
 # Areas over h**2 / 2. Of the facets of real and synthetic cities the largest has 1.5, the smallest on open ground
 # 0.25.
 MOST, LEAST = 2.0, 0.15
+# Vertical edges over h.
+TALLEST, LOWEST = 1.6, 0.3
 CLEAR = 2.0  # sizes; open ground is that far from vertices of houses and from the border of a piece
 COMMON = 0.01  # m; parts of a house share no longer wall than this where they have one height
 PLANES, BLOCK, TOP = LEVELS.index("2.2"), LEVELS.index("1.2"), LEVELS.index("0A")
@@ -247,16 +249,19 @@ def zone_finer(record: RunRecord) -> list[Finer]:
 
 
 def check_sizes_of_zones(
-    surface: Surface, outline: Vertices, finer: Sequence[Finer], record: RunRecord
+    surface: Surface,
+    outline: Vertices,
+    upright: NDArray[np.float64],
+    finer: Sequence[Finer],
+    record: RunRecord,
 ) -> Finding:
-    """Measure the facets of a piece's top; `outline` (k, 2, 2) are the edges of its plan."""
+    """Measure the facets of a piece's top, and its columns, `upright` (c, 4): place, shortest and longest edge.
+
+    `outline` (k, 2, 2) are the edges of its plan.
+    """
     top, asked = surface.marked(Marker.TOP), record.sizes
     middle = surface.corners[top].mean(axis=1)
-    size = finer_sizes(finer, middle[:, :2], asked.largest)
-    if record.core is not None:  # in the pad they grow beyond that
-        west, south, east, north = record.core
-        beyond = ~shapely.intersects_xy(shapely.box(west, south, east, north), middle[:, 0], middle[:, 1])
-        size[beyond & (size >= asked.largest)] = np.inf
+    size = _sizes_at(middle[:, :2], finer, record)
     share = np.abs(surface.area[top]) / (size**2 / 2)
     rows = np.flatnonzero(size <= asked.mesh_size) if asked.alone else np.empty(0, np.int64)
     open_rows = rows[_are_clear(surface, outline, middle[rows, :2], CLEAR * size[rows])]
@@ -266,7 +271,40 @@ def check_sizes_of_zones(
         *find_faults("zone-too-coarse", middle[share > MOST], f"{high:.3g} of h^2 / 2; bound: {MOST:g}"),
         *find_faults("zone-too-fine", middle[small], f"{low:.3g} of h^2 / 2; bound: {LEAST:g}"),
     ]
-    return Finding(tuple(faults), {"facets": len(share), "open": len(open_rows)}, {"share": high, "-least": -low})
+    found = Finding(tuple(faults), {"facets": len(share), "open": len(open_rows)}, {"share": high, "-least": -low})
+    return join_findings(found, _check_columns(surface, outline, upright, finer, record))
+
+
+def _check_columns(
+    surface: Surface,
+    outline: Vertices,
+    upright: NDArray[np.float64],
+    finer: Sequence[Finer],
+    record: RunRecord,
+) -> Finding:
+    """Hold vertical edges against the sizes at their places."""
+    xy, places, asked = upright[:, :2], np.insert(upright[:, :2], 2, 0.0, axis=1), record.sizes
+    size = _sizes_at(xy, finer, record)
+    tall = upright[:, 3] / size
+    rows = np.flatnonzero(size <= asked.mesh_size) if asked.alone and asked.even else np.empty(0, np.int64)
+    open_rows = rows[_are_clear(surface, outline, xy[rows], CLEAR * size[rows])]
+    short = upright[open_rows, 2] / size[open_rows]
+    high, low = float(tall.max(initial=0.0)), float(short.min(initial=1.0))
+    faults = [
+        *find_faults("zone-too-tall", places[tall > TALLEST], f"{high:.3g} h; bound: {TALLEST:g}"),
+        *find_faults("zone-too-low", places[open_rows[short < LOWEST]], f"{low:.3g} h; bound: {LOWEST:g}"),
+    ]
+    sums = {"columns": len(xy), "open columns": len(open_rows)}
+    return Finding(tuple(faults), sums, {"tall": high, "-low": -low})
+
+
+def _sizes_at(xy: NDArray[np.float64], finer: Sequence[Finer], record: RunRecord) -> NDArray[np.float64]:
+    """Give the sizes that zones and their growth ask for at places (n, 2), infinite where a pad has larger."""
+    size = finer_sizes(finer, xy, record.sizes.largest)
+    if record.core is not None:
+        beyond = ~shapely.intersects_xy(shapely.box(*record.core), xy[:, 0], xy[:, 1])
+        size[beyond & (size >= record.sizes.largest)] = np.inf
+    return size
 
 
 def _are_clear(
@@ -288,6 +326,8 @@ def prove_sizes_of_zones(found: Finding) -> Proof:
     claim = (
         f"{int(found.sums['facets'])} facets of the top have the sizes h of zones and of the growth between them: "
         f"{found.largest['share']:.2f} of h^2 / 2 at most, and {-found.largest['-least']:.2f} at least for "
-        f"{int(found.sums['open'])} on open ground"
+        f"{int(found.sums['open'])} on open ground; vertical edges of {int(found.sums['columns'])} columns are "
+        f"{found.largest['tall']:.2f} h at most, and {-found.largest['-low']:.2f} h at least for "
+        f"{int(found.sums['open columns'])} on open ground"
     )
     return Proof(claim, found.faults)

@@ -95,12 +95,15 @@ class SizesAsked:
         Growth from edge to edge around zones.
     alone : bool
         Whether nothing else makes triangles finer: walls, further areas, land cover.
+    even : bool
+        Whether the vertical spacing does not grow from the ground upwards.
     """
 
     mesh_size: float = 10.0
     largest: float = 10.0
     growth: float = 1.2
     alone: bool = False
+    even: bool = True
 
 
 @dataclass(frozen=True)
@@ -292,7 +295,8 @@ def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:
 def _read_sizes(given: Mapping[str, Any]) -> SizesAsked:
     size, others = float(given["mesh_size"]), ("wall_size", "refine", "refine_areas", "land_cover", "water_points")
     alone = not any(given.get(name) for name in others)
-    return SizesAsked(size, max(size, float(given["open_size"])), float(given["refine_growth"]), alone)
+    largest, growth = max(size, float(given["open_size"])), float(given["refine_growth"])
+    return SizesAsked(size, largest, growth, alone, not given.get("first_layer"))
 
 
 def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:
