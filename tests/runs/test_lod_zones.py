@@ -29,6 +29,8 @@ from tiler.check.check_piece import read_piece
 from tiler.check.proofs import Finding, join_findings, make_surface
 from tiler.check.zone_proofs import (
     BLOCK_ROWS,
+    CELL_ROWS,
+    GivenBlocks,
     check_sizes_of_zones,
     check_zones,
     prove_sizes_of_zones,
@@ -48,7 +50,7 @@ from tiler.planning.region import Region
 from tiler.store.kept import is_kept
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.results import StoredTerrain
-from tiler.store.run_folder import RoofRules, RunRecord, SizesAsked, read_run_record
+from tiler.store.run_folder import CELLS_REPLACED, RoofRules, RunRecord, SizesAsked, read_run_record
 from tiler.store.store import Store
 from tiler.workflow.stage_sequence import make_engine
 
@@ -90,11 +92,14 @@ def prove_levels(
     *,
     lower: float = 0.0,
     clearance: float = 2.0,
+    given: GivenBlocks | None = None,
 ) -> set[str]:
     """Faults of a city model in place of that of a run, as if blocks were given lower (m)."""
     (folder / CITY_MODEL).write_text(text)
     rules = RoofRules(raised=clearance, clearance=clearance)
-    given = read_given_blocks(out / STORE, StoredTerrain(out / STORE), rules)
+    given = given or read_given_blocks(
+        out / STORE, StoredTerrain(out / STORE), RunRecord("", BOUNDS, 0.0, {}, roofs=rules)
+    )
     given = replace(given, rows={name: (row[0], row[1] - lower, *row[2:]) for name, row in given.rows.items()})
     proof = check_zones(zones, folder / CITY_MODEL, out / FULL_CITY_MODEL, stated, given)
     return {fault.kind for fault in proof.faults}
@@ -233,8 +238,24 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
     asked = read_zones(config, Region(BOUNDS, CRS, SIZE))
     x, y = next(row[LOD_POINT] for row in told.values() if row[LOD] == "1.2")
     assert not prove_levels(text, asked, tmp_path / "out", tmp_path)
-    assert prove_levels(text, (*asked[:-1], ("0C", 6.0, "")), tmp_path / "out", tmp_path) == {"level-of-zone"}
-    assert is_kept(BLOCK_ROWS, "pieces")  # what a run was given stays for `check`
+    other = (*asked[:-1], ("0C", 6.0, ""))
+    assert prove_levels(text, other, tmp_path / "out", tmp_path) == {"level-of-zone", "cell-level"}
+    assert all(is_kept(stage, "pieces") for stage in (BLOCK_ROWS, CELL_ROWS))  # what a run was given, for `check`
+    # A cell of another level, with a point elsewhere, around other buildings, or one that is gone.
+    record = RunRecord("", BOUNDS, 0.0, {}, roofs=RoofRules(raised=2.0, clearance=2.0))
+    given = read_given_blocks(tmp_path / "out" / STORE, StoredTerrain(tmp_path / "out" / STORE), record)
+    ((level, east, north),) = given.cell_places
+    stated = {name: sum(row[LOD] == name for row in told.values()) for name in LEVELS} | {CELLS_REPLACED: 1}
+    whole = np.array([shapely.box(*BOUNDS)])
+    for change, kinds in (
+        ({}, set()),
+        ({"cell_places": [(level - 1, east, north)]}, {"cell-level", "block-cell"}),
+        ({"cell_places": [(level, WEST + 10, north)]}, {"cell-point", "block-cell"}),
+        ({"cells": whole}, {"building-in-cell"}),
+        ({"cell_places": [], "cells": whole[:0]}, {"cell-count", "block-cell"}),
+    ):
+        cells = replace(given, **change)
+        assert prove_levels(text, asked, tmp_path / "out", tmp_path, stated, given=cells) == kinds
     # A block of another height, level or point than the run was given, and one that it was not given.
     for was, now, kind in (
         ('"roof_height":15.0', '"roof_height":15.1', "block-height"),
@@ -248,7 +269,6 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
         assert prove_levels(text, asked, tmp_path / "out", tmp_path, lower=1, clearance=clearance) == faults
     moved = text.replace(f"[{x!r},{y!r}]", f"[{WEST + 1.5 * SIZE!r},{y!r}]")
     relabelled = text.replace(f'"{LOD}":"0B"', f'"{LOD}":"1.2"', 1)
-    stated = {name: sum(row[LOD] == name for row in told.values()) for name in LEVELS}
     assert not prove_levels(text, asked, tmp_path / "out", tmp_path, stated)
     assert "level-count" in prove_levels(relabelled, asked, tmp_path / "out", tmp_path, stated)
     assert "building-in-block" in prove_levels(moved, asked, tmp_path / "out", tmp_path)

@@ -143,7 +143,7 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
         claims += models
         if record.zones:
             files_of_models = directory / CITY_MODEL, directory / FULL_CITY_MODEL
-            given = read_given_blocks(directory / STORE, load_dtm(directory / STORE), record.roofs)
+            given = read_given_blocks(directory / STORE, load_dtm(directory / STORE), record)
             claims += (check_zones(record.zones, *files_of_models, record.level_counts, given),)
         parts = sums.count_parts()
         remarks = (report_parts(parts),) if len(parts) > 1 else ()

@@ -24,14 +24,16 @@ from tiler.citymodels.building_index import BuildingRow, copy_vertices, has_part
 from tiler.config.step_options import make_finer
 from tiler.config.zone_levels import find_levels
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
-from tiler.store.run_folder import RoofRules, RunRecord
+from tiler.store.result_file import ResultFile
+from tiler.store.run_folder import CELLS_REPLACED, RoofRules, RunRecord
 from tiler.store.store import Store
 
 WITHIN = 0.002  # m; a point lies in its building's outline, whose coordinates are rounded to 1 mm
 WALL_SAMPLE = 0.5  # m; between the places on walls where the terrain is looked up
 RAISED = 0.02  # m; of a raised roof against these, as outlines are rounded to 1 mm
 ROUNDED = 0.003  # m; heights of the city model are rounded to 1 mm
-BLOCK_ROWS, BATCH = "blocks", 10_000  # stage with the blocks that a run was given; rows that are read at once
+# Stages with the blocks that a run was given, and with their cells; rows that are read at once.
+BLOCK_ROWS, CELL_ROWS, BATCH = "blocks", "block-cells", 10_000
 # Areas over h**2 / 2. Of the facets of real and synthetic cities the largest has 1.5, the smallest on open ground
 # 0.25.
 MOST, LEAST = 2.0, 0.15
@@ -50,35 +52,62 @@ DETAILS = {
     "block-unknown": "a building at a level of blocks is none of those that the run was given",
     "block-level": "a block has another level or point than the one that the run was given",
     "block-height": f"a block has not its height above its ground, nor is it raised; bound: {ROUNDED:g} m",
+    "block-cell": "a block that the run was given is of no cell at its level with its point",
+    "cell-level": "a cell of blocks has another level of detail than the zone of its point asks for",
+    "cell-point": f"the point of a cell of blocks is outside of it; bound: {WITHIN:g} m",
+    "cell-count": "run.json counts another number of cells that blocks stand for",
+    "building-in-cell": "a building lies as a whole in a cell that blocks stand for",
     "level-parts": "parts of a house at level 1.2 share a wall; they are one outline there",
 }
 
 
 @dataclass(frozen=True, eq=False)
 class GivenBlocks:
-    """Blocks that a run was given, by id: level, height (m), point; terrain, and how roofs are raised over it."""
+    """Blocks that a run was given, by id: level, height (m), point; cells, terrain, rules of raised roofs."""
 
     rows: Mapping[str, tuple[int, float, float, float]]
     dtm: Dtm
     roofs: RoofRules
+    cells: NDArray[np.object_]  # outlines of the cells whose buildings blocks stand for
+    cell_places: Sequence[tuple[int, float, float]]  # level and point of each
+    inner: shapely.Geometry  # what of the region is away from its sides, where houses are clipped
 
 
-def read_given_blocks(store: Path, dtm: Dtm, roofs: RoofRules) -> GivenBlocks:
-    """Read the blocks of a run, some at a time; there may be none."""
+def read_given_blocks(store: Path, dtm: Dtm, record: RunRecord) -> GivenBlocks:
+    """Read the blocks of a run and their cells, some at a time; there may be none."""
     rows: dict[str, tuple[int, float, float, float]] = {}
     stored = Store(store)
-    for name in stored.names(BLOCK_ROWS):
-        with stored.open(BLOCK_ROWS, name) as found:
-            ends = found.read("id_end") if "id_end" in found.names else np.empty(0, np.int64)
-            for k in range(0, len(ends), BATCH):
-                some = [(k, min(k + BATCH, len(ends)))]
-                start = np.concatenate(([ends[k - 1]] if k else [0], ends[slice(*some[0])]))
-                text = found.read("id", [(int(start[0]), int(start[-1]))]).tobytes()
-                level, place = find_blocks(found.read("forms", some))
-                height = found.read("given_height", some)
-                for i, (first, last) in enumerate(pairwise((start - start[0]).tolist())):
-                    rows[text[first:last].decode()] = (int(level[i]), float(height[i]), *place[i].tolist())
-    return GivenBlocks(rows, dtm, roofs)
+    for names, found, some in _scan_rows(stored, BLOCK_ROWS):
+        level, place = find_blocks(found.read("forms", some))
+        height = found.read("given_height", some)
+        for i, name in enumerate(names):
+            rows[name.decode()] = (int(level[i]), float(height[i]), *place[i].tolist())
+    cells, places = [np.empty(0, np.object_)], list[tuple[int, float, float]]()
+    for names, found, some in _scan_rows(stored, CELL_ROWS):
+        cells.append(shapely.from_wkb(_cut(found, "wkb", *some[0])))
+        for name in names:
+            word, x, y, _ = name.decode().split(" ", 3)
+            places.append((LEVELS.index(word), float(x), float(y)))
+    inner = shapely.box(*(record.core or record.bounds)).buffer(-record.sizes.clearance - WITHIN)
+    return GivenBlocks(rows, dtm, record.roofs, np.concatenate(cells), places, inner)
+
+
+def _scan_rows(stored: Store, stage: str) -> Iterator[tuple[list[bytes], ResultFile, list[tuple[int, int]]]]:
+    """Go through the rows of a stage, some at a time: their ids, the file, and the range of rows."""
+    for name in stored.names(stage):
+        with stored.open(stage, name) as found:
+            n = len(found.read("id_end")) if "id_end" in found.names else 0
+            for k in range(0, n, BATCH):
+                some = k, min(k + BATCH, n)
+                yield _cut(found, "id", *some), found, [some]
+
+
+def _cut(found: ResultFile, name: str, first: int, last: int) -> list[bytes]:
+    """Cut the bytes of some rows out of those of all."""
+    ends = found.read(f"{name}_end", [(max(first - 1, 0), last)])
+    start = ends if first else np.insert(ends, 0, 0)
+    data = found.read(name, [(int(start[0]), int(start[-1]))]).tobytes()
+    return [data[a:b] for a, b in pairwise((start - start[0]).tolist())]
 
 
 def check_zones(
@@ -162,7 +191,7 @@ class _Found:
         found = find_levels(self._zones, rows[:, :2])
         found = np.where(level <= BLOCK, np.minimum(found, BLOCK), found)  # a building that is in no cell
         found = np.where(level == TOP - 1, np.minimum(found, TOP - 1), found)  # not all cells of a block are at 0A
-        within, blocks = self._look_up(full_model, rows)
+        within, blocks, kept = self._look_up(full_model, rows)
         covered = np.zeros(len(rows), np.bool_)
         single = np.flatnonzero(level <= BLOCK)
         tree = shapely.STRtree(blocks)
@@ -175,6 +204,8 @@ class _Found:
             *_fault("level-of-zone", rows[level != found]),
             *_fault("level-point", rows[~within & (level <= BLOCK)]),
             *_fault("building-in-block", rows[covered]),
+            *_fault("building-in-cell", rows[kept & (level <= BLOCK)]),
+            *([] if self._blocks is None else _look_at_cells(self._blocks, self._zones, stated)),
             *_fault("level-parts", np.array(self._common_walls()).reshape(-1, 3)),
         ]
         shown = ", ".join(f"{n} of {name}" for name, n in zip(LEVELS, count, strict=True) if n)
@@ -189,18 +220,31 @@ class _Found:
             for fault in _fault(kind, np.array([place for other, *place in self._faults if other == kind]))
         ]
 
-    def _look_up(self, full_model: Path, rows: NDArray[np.float64]) -> tuple[NDArray[np.bool_], list[Any]]:
-        """Tell which points are in the outline of their house before simplification, and give those of blocks."""
+    def _look_up(
+        self, full_model: Path, rows: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], list[Any], NDArray[np.bool_]]:
+        """Tell which points are in the outline of their house before simplification, and give those of blocks.
+
+        Also tells of which rows this outline lies in a cell that blocks stand for.
+        """
         within, blocks, of_house = np.zeros(len(rows), np.bool_), list[Any](), dict[str, list[int]]()
+        cells, kept = shapely.STRtree([] if self._blocks is None else self._blocks.cells), within.copy()
         for row, name in enumerate(self._names):
             of_house.setdefault(name, []).append(row)
 
         for name, _, building in _iterate(full_model):
             if mine := of_house.get(name):
                 within[mine] = shapely.dwithin(building.footprint, shapely.points(rows[mine, :2]), WITHIN)
+                kept[mine] = self._lies_in_cell(name, building.footprint, cells)
                 if rows[mine[0], 3] > BLOCK:
                     blocks.append(building.footprint)
-        return within, blocks
+        return within, blocks, kept
+
+    def _lies_in_cell(self, name: str, outline: shapely.Geometry, cells: shapely.STRtree) -> bool:
+        """Whether a house lies in a cell, so that its point did: no part of a footprint, which lies elsewhere, too."""
+        if self._blocks is None or name.rpartition("-")[2].isdecimal():
+            return False
+        return bool(len(cells.query(outline, "within")) and shapely.within(outline, self._blocks.inner))
 
     def _common_walls(self) -> list[tuple[float, float, float]]:
         places = []
@@ -212,6 +256,24 @@ class _Found:
                         x, y = shapely.get_coordinates(common)[0].tolist()
                         places.append((x, y, 0.0))
         return places
+
+
+def _look_at_cells(blocks: GivenBlocks, zones: Zones, stated: Mapping[str, int] | None) -> list[Fault]:
+    """Hold the cells of blocks against zones, blocks against cells, and their number against the record."""
+    places = np.array(blocks.cell_places, np.float64).reshape(-1, 3)
+    level, shown = places[:, 0].astype(np.int64), np.insert(places[:, 1:], 2, 0.0, axis=1)
+    found = find_levels(zones, places[:, 1:])
+    found = np.where(level == TOP - 1, np.minimum(found, TOP - 1), found)  # not all cells of a block are at 0A
+    away = ~shapely.dwithin(blocks.cells, shapely.points(places[:, 1:]), WITHIN)
+    known = set(blocks.cell_places)
+    lost = [(x, y, height) for of, height, x, y in blocks.rows.values() if (of, x, y) not in known]
+    wrong = [(0.0, 0.0, 0.0)] if stated is not None and stated[CELLS_REPLACED] != len(places) else []
+    return [
+        *_fault("block-cell", np.array(lost)),
+        *_fault("cell-level", shown[level != found]),
+        *_fault("cell-point", shown[away]),
+        *_fault("cell-count", np.array(wrong)),
+    ]
 
 
 def _look_at_block(blocks: GivenBlocks, values: Mapping[str, Any], building: BuildingRow, level: int) -> str:

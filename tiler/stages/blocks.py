@@ -22,6 +22,7 @@ from tiler.footprints.model_places import ModelPlaces, give_way
 from tiler.footprints.plan_shapes import scan_shapes
 from tiler.objects.places import place
 from tiler.stages.readers import extent_of, hull, own_notes, put_rows, read_outlines
+from tiler.store.run_folder import CELLS_REPLACED
 from tiler.vectors.features import to_objects
 from tiler.vectors.lengths import number_of
 
@@ -71,7 +72,7 @@ def read_cells(task: Task) -> Facts:
     if not facts["n"]:
         name = place(task.parameters.generalised).name
         task.note(Note("no-cells-in-zones", name, detail="no building is replaced: is it of another place?"))
-    return facts | {"counts": {"cells replaced by blocks": facts["n"]}}
+    return facts | {"counts": {CELLS_REPLACED: facts["n"]}}
 
 
 def read_blocks(task: Task) -> Facts:

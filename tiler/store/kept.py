@@ -10,7 +10,7 @@ from tiler.store.out_folder import INDEXES, PIECES, RUN_RECORD, STORE
 
 WHOLE, IN_STORE, IN_PIECES = KEPT
 # What stays with the pieces: the stage that states their checksums, and what `check` holds them against.
-OF_PIECES = ("pieces", "terrain", "approach", "levelled", "covered", "levels", "leaves", "blocks")
+OF_PIECES = ("pieces", "terrain", "approach", "levelled", "covered", "levels", "leaves", "blocks", "block-cells")
 
 
 def is_kept(stage: str, keep: str) -> bool:

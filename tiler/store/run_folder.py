@@ -20,6 +20,7 @@ from tiler.config.zones import LEVELS, Zones
 from tiler.store.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
+CELLS_REPLACED = "cells replaced by blocks"  # count of cells whose buildings are left out
 RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts", "land_cover", "zones")
 TILES = "tiles"
 EASED = "roof nodes moved for cells"  # a count: roofs at vertices of outlines
@@ -97,6 +98,8 @@ class SizesAsked:
         Whether nothing else makes triangles finer: walls, further areas, land cover.
     even : bool
         Whether the vertical spacing does not grow from the ground upwards.
+    clearance : float
+        Least distance of walls, also from the region's sides (m).
     """
 
     mesh_size: float = 10.0
@@ -104,6 +107,7 @@ class SizesAsked:
     growth: float = 1.2
     alone: bool = False
     even: bool = True
+    clearance: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -146,7 +150,7 @@ class RunRecord:
     zones : Zones
         Zones of detail; none where all buildings have one level.
     level_counts : mapping of str to int
-        Building parts at each level of detail, where there are zones.
+        Building parts at each level of detail, where there are zones, and `CELLS_REPLACED`.
     sizes : SizesAsked
         Other sizes, where there are zones.
     """
@@ -242,6 +246,7 @@ def read_run_record(path: Path) -> RunRecord:
         if not zones and (given.get("focus") or given.get("lod_zones")):
             raise InputError(f"{path}: its parameters name zones of detail, and the zones are missing; run again")
         at_levels = {level: int(record["counts"].get(f"parts at level {level}", 0)) for level in LEVELS}
+        at_levels[CELLS_REPLACED] = int(record["counts"].get(CELLS_REPLACED, 0))
         sizes = _read_sizes(given) if zones else SizesAsked()
         spacing = float(given.get("dtm_spacing", 1.0))
         ground = tuple(GroundPatch(str(row["patch"]), _optional(row["z0 (m)"])) for row in found)
@@ -296,7 +301,7 @@ def _read_sizes(given: Mapping[str, Any]) -> SizesAsked:
     size, others = float(given["mesh_size"]), ("wall_size", "refine", "refine_areas", "land_cover", "water_points")
     alone = not any(given.get(name) for name in others)
     largest, growth = max(size, float(given["open_size"])), float(given["refine_growth"])
-    return SizesAsked(size, largest, growth, alone, not given.get("first_layer"))
+    return SizesAsked(size, largest, growth, alone, not given.get("first_layer"), float(given["clearance"]))
 
 
 def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:
