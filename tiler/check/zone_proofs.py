@@ -241,7 +241,7 @@ class _Found:
         return within, blocks, kept
 
     def _lies_in_cell(self, name: str, outline: shapely.Geometry, cells: shapely.STRtree) -> bool:
-        """Whether a house lies in a cell, so that its point did: no part of a footprint, which lies elsewhere, too."""
+        """Whether a house lies in a cell, so that its point did: no part of a footprint, which has more places."""
         if self._blocks is None or name.rpartition("-")[2].isdecimal():
             return False
         return bool(len(cells.query(outline, "within")) and shapely.within(outline, self._blocks.inner))
