@@ -1,6 +1,6 @@
 """Houses on their way through step 2: divided in parts, each with its points (after steps 1.6 and 2.0)."""
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,19 +20,22 @@ from pipeline.city_model.shaped_roofs import form_roofs, shape_roofs
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roof_forms import NO_FORM, POINTS_TELL, SHAPE
-from pipeline.data.roofs import Roofs, choose_roofs, flat_roofs, join_roofs, take_roofs
-from pipeline.geometry.inside import find_inside
+from pipeline.data.roofs import ROOF_FALLBACKS, Roofs, choose_roofs, flat_roofs, join_roofs, take_roofs
 from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, fit_roofs, replace_roofs
+from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, fit_roofs, replace_roofs, take_roof
 from pipeline.roofs.roof_points import (
     RoofPoints,
     add_roof_points,
+    divide_roof_points,
     keep_roof_points,
     locate_roof_points,
-    make_roof_points,
     no_roof_points,
 )
 from pipeline.roofs.roof_surfaces import RoofSurfaces
+
+NO_POINTS, FEW_POINTS = (ROOF_FALLBACKS.index(why) for why in ("no roof points", "few roof points"))
+FULL_CLEARANCE = 0.2  # m; of walls between planes of the full city model, 1.5 times of which they keep
+FULL_PRICE = 0.5  # share of the price of a cut that it has there
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +65,8 @@ class Houses:
         Roof and ground points of each part.
     notes : tuple of Note
         What became of given forms, where the houses were divided just now.
+    full : HouseRoofs or None
+        Their division for the full city model, where it was asked for: closer to the points.
     """
 
     ids: NDArray[np.str_]
@@ -74,6 +79,7 @@ class Houses:
     form: NDArray[np.int8]
     points: BuildingPoints
     notes: tuple[Note, ...] = ()
+    full: HouseRoofs | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -89,6 +95,7 @@ def divide_houses(
     unmarked: NDArray[np.bool_] | None = None,
     surfaces: RoofSurfaces | None = None,
     prefer_points: bool = False,
+    full: bool = False,
 ) -> Houses:
     """Divide houses by the planes of their roofs, or where these step (step 2.0, ours).
 
@@ -112,18 +119,20 @@ def divide_houses(
         Roof surfaces of the houses by a city model; not used where roofs are flat.
     prefer_points : bool
         Whether such a roof counts only where points are too few for planes.
+    full : bool
+        Whether to divide sloped roofs for the full city model besides.
     """
     model = city.model
     marks = has_building_class(cloud) if building_class is None else building_class
     parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
     sloped = options.roofs != "flat"
     part_roofs, method, too_few = None, np.full(len(model), FLAT, np.int8), np.zeros(len(model), np.bool_)
-    form, notes = np.full(len(model), NO_FORM, np.int8), list[Note]()
+    form, notes, finer = np.full(len(model), NO_FORM, np.int8), list[Note](), None
     if (options.split_levels or sloped) and options.simplify == "clearance" and len(model):
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         if sloped:
-            fitted, form, notes = _fit_sloped(city, roofs, options, surfaces, prefer_points)
+            fitted, finer, form, notes = _fit_sloped(city, roofs, options, surfaces, prefer_points, full)
             parts, part_roofs, method, too_few = fitted.parts, fitted.roofs, fitted.method, fitted.too_few
         else:
             parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
@@ -152,15 +161,22 @@ def divide_houses(
         form,
         points,
         tuple(notes),
+        finer,
     )
 
 
 def _fit_sloped(
-    city: City, points: RoofPoints, options: CityOptions, surfaces: RoofSurfaces | None, prefer_points: bool
-) -> tuple[HouseRoofs, NDArray[np.int8], list[Note]]:
+    city: City,
+    points: RoofPoints,
+    options: CityOptions,
+    surfaces: RoofSurfaces | None,
+    prefer_points: bool,
+    full: bool,
+) -> tuple[HouseRoofs, HouseRoofs | None, NDArray[np.int8], list[Note]]:
     """Roofs of a city model, of planes, of given forms, and hipped ones, in this order where all are looked for.
 
     Where planes are, points tell the roof if they are enough; else a given form does, and at last the outline.
+    In the full city model walls between planes keep less distance, and need to save less; all else is the same.
     """
     model = city.model
     distances = {"clearance": options.clearance, "finer": options.finer_clearance}
@@ -169,7 +185,9 @@ def _fit_sloped(
     laid[list(new)] = True
     used = points if prefer_points else leave_out_points(points, laid)
     rules = RoofOptions(clearance=options.clearance, cut_price=options.roof_price)
-    fitted = fit_roofs(model.polygons, used, rules)
+    again = full and options.roofs == "planes" and (prefer_points or not laid.all())
+    closer = (min(FULL_CLEARANCE, options.clearance), FULL_PRICE * options.roof_price) if again else None
+    fitted, finer = fit_roofs(model.polygons, used, rules, closer)
     if prefer_points:
         laid &= fitted.too_few
         new = {row: roof for row, roof in new.items() if laid[row]}
@@ -180,7 +198,12 @@ def _fit_sloped(
     form[given & ~left & ~laid] = POINTS_TELL
     told = city.roof_source != ROOF_SOURCES.index("default")
     hipped = left & (form < 0) & (told if options.roofs == "planes" else True)
-    return shape_roofs(fitted, model.polygons, hipped, model.ground, model.roof), form, [*told_of, *notes]
+    fitted = shape_roofs(fitted, model.polygons, hipped, model.ground, model.roof)
+    whole = fitted if full else None
+    if finer is not None:
+        rows = np.flatnonzero(laid | left)
+        whole = replace_roofs(finer, {row: take_roof(fitted, row) for row in rows.tolist()})
+    return fitted, whole, form, [*told_of, *notes]
 
 
 def leave_out_points(points: RoofPoints, without: NDArray[np.bool_]) -> RoofPoints:
@@ -197,13 +220,32 @@ def _collect_roof_points(
     """Roof points of parts: of class 6 inside, and for unmarked houses those of the house inside."""
     mine = unmarked[parts.house]
     marked = locate_roof_points(cloud, parts.polygons[~mine], building_class=True)
-    owner = np.repeat(np.arange(len(unmarked)), np.diff(roofs.start))
-    part, point = find_inside(roofs.xyz, parts.polygons[mine], among=unmarked[owner])
-    own = parts.house[mine][part] == owner[point]
-    start = np.concatenate(([0], np.cumsum(np.bincount(part[own], minlength=int(mine.sum())))))
+    own = divide_roof_points(roofs, parts.polygons[mine], parts.house[mine])
     found = add_roof_points(no_roof_points(len(mine)), np.flatnonzero(~mine), marked)
-    found = add_roof_points(found, np.flatnonzero(mine), make_roof_points(start, roofs.xyz[point[own]]))
+    found = add_roof_points(found, np.flatnonzero(mine), own)
     return found.start, found.z
+
+
+def name_parts(ids: NDArray[np.str_], row: NDArray[np.int64], reserved: Set[str]) -> NDArray[np.str_]:
+    """Ids of faces; those of a house of several are numbered, reserved names left out."""
+    count = np.bincount(row, minlength=len(ids))
+    seen = np.zeros(len(ids), np.int64)
+    names = []
+    for k in row.tolist():
+        seen[k] += 1
+        name = str(ids[k])
+        part = name if count[k] == 1 else f"{name}-part{seen[k]}"
+        while count[k] > 1 and part in reserved:
+            part += "-"
+        names.append(part)
+    return np.array(names, dtype=np.str_)
+
+
+def find_fallbacks(houses: Houses) -> NDArray[np.int8]:
+    """Index into `ROOF_FALLBACKS` of each house."""
+    count = np.bincount(houses.parts.house, np.diff(houses.points.roof_start), len(houses))
+    reason = np.where(houses.too_few, np.where(count > 0, FEW_POINTS, NO_POINTS), 0)
+    return np.where((houses.method == FLAT) & (houses.form < 0), reason, 0).astype(np.int8)
 
 
 def find_model_roofs(houses: Houses) -> Roofs | None:

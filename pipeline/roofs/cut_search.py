@@ -54,7 +54,7 @@ def rank_cuts(
     xyz: Array,
     cost: Array,
     face: Index,
-    piece: int,
+    rows: Index,
     lines: tuple[Array, Array, Array, Index],
     min_points: int,
     price: float,
@@ -69,8 +69,8 @@ def rank_cuts(
         Misfit of each under each plane.
     face : int64, (n,)
         Face of each.
-    piece : int
-        The face that is to be cut.
+    rows : int64, (m,)
+        The points of the face that is to be cut, at least one.
     lines : tuple
         Directions, (d, 2), along each of which the best line is looked for; direction and offset of further
         lines, (l, 3); and what `order_across` gives for the directions.
@@ -86,22 +86,18 @@ def rank_cuts(
         `MAX_TRIES`.
     """
     along, fixed, across, order = lines
-    n, total = 0, np.zeros(cost.shape[1])
-    for p in range(len(face)):
-        if face[p] == piece:
-            n += 1
-            for k in range(len(total)):
-                total[k] += cost[p, k]
+    total = sum_costs(cost, rows)
+    sums = (total, len(rows), min_points)
     n_lines = len(along) + len(fixed) if total.min() >= price else 0
     found, loss = np.empty((n_lines, 4)), np.zeros(n_lines)
     for d in range(n_lines):
         if d < len(along):
             found[d, 0], found[d, 1] = along[d, 0], along[d, 1]
-            saved, found[d, 2] = _best_offset(cost, face, piece, order[d], across[d], (total, n, min_points))
+            saved, found[d, 2] = _best_offset(cost, face, face[rows[0]], order[d], across[d], sums)
             loss[d] = -saved
         else:
             found[d, 0], found[d, 1], found[d, 2] = fixed[d - len(along)]
-            saved = _saved_by(xyz, cost, face, piece, fixed[d - len(along)], (total, n, min_points))
+            saved = _saved_by(xyz, cost, rows, fixed[d - len(along)], sums)
             loss[d] = -saved - RIDGE_BONUS * price
         found[d, 3] = saved
     ranked, n_ranked = np.empty((MAX_TRIES, 4)), 0
@@ -115,8 +111,8 @@ def rank_cuts(
 
 @kernel
 def shift_cuts(
-    points: tuple[Array, Array, Index],
-    piece: int,
+    xyz: Array,
+    cost: Array,
     rows: Index,
     ranked: Array,
     min_points: int,
@@ -126,12 +122,8 @@ def shift_cuts(
 
     Parameters
     ----------
-    points
-        Points of the house (m), their misfits, and their faces, as for `rank_cuts`.
-    piece, min_points
+    xyz, cost, rows, min_points
         As for `rank_cuts`.
-    rows : int64, (n,)
-        The points of the piece.
     ranked : float64, (k, 4)
         As from there.
     rules : tuple of 2 floats
@@ -142,7 +134,6 @@ def shift_cuts(
     float64, (m, 4)
         As `ranked`.
     """
-    xyz, cost, face = points
     price, clearance = rules
     sums = (sum_costs(cost, rows), len(rows), min_points)
     lines, m = np.empty((len(ranked) * 2 * SHIFTS, 4)), 0
@@ -150,7 +141,7 @@ def shift_cuts(
         for step in range(-SHIFTS, SHIFTS + 1):
             lines[m, :2] = ranked[k, :2]
             lines[m, 2] = ranked[k, 2] + step * clearance / SHIFTS
-            lines[m, 3] = _saved_by(xyz, cost, face, piece, lines[m, :3], sums) if step else 0.0
+            lines[m, 3] = _saved_by(xyz, cost, rows, lines[m, :3], sums) if step else 0.0
             if lines[m, 3] >= price:
                 m += 1
     kept: Array = lines[:m][order_values(-lines[:m, 3])]
@@ -182,14 +173,12 @@ def _best_offset(
 
 
 @kernel
-def _saved_by(
-    xyz: Array, cost: Array, face: Index, piece: int, line: Array, sums: tuple[Array, int, int]
-) -> float:
+def _saved_by(xyz: Array, cost: Array, rows: Index, line: Array, sums: tuple[Array, int, int]) -> float:
     """What a line saves; 0 with too few points on a side."""
     total, n, min_points = sums
     left, before = np.zeros(len(total)), 0
-    for p in range(len(face)):
-        if face[p] == piece and xyz[p, 1] * line[0] - xyz[p, 0] * line[1] < line[2]:
+    for p in rows:
+        if xyz[p, 1] * line[0] - xyz[p, 0] * line[1] < line[2]:
             before += 1
             for k in range(len(total)):
                 left[k] += cost[p, k]
@@ -241,6 +230,10 @@ def find_rectangle(
     best = np.zeros(9)
     total = sum_costs(cost, rows)
     base = total.argmin()
+    most = np.zeros(len(total))  # that each plane may save
+    for p in rows:
+        for k in range(len(total)):
+            most[k] += max(cost[p, base] - cost[p, k], 0.0)
     t, u = np.empty(n), np.empty(n)
     i, j = np.empty(n, np.int64), np.empty(n, np.int64)
     for d in range(min(len(along), 2)):
@@ -261,10 +254,7 @@ def find_rectangle(
             i[m], j[m] = int((t[m] - low_t) / step_t), int((u[m] - low_u) / step_u)
             grid[1, i[m], j[m]] += 1
         for k in range(len(total)):
-            saved = 0.0
-            for p in rows:
-                saved += max(cost[p, base] - cost[p, k], 0.0)
-            if k == base or saved <= max(price, best[0]):
+            if k == base or most[k] <= max(price, best[0]):
                 continue
             grid[0] = 0
             for m in range(n):

@@ -1,8 +1,8 @@
 """Roofs of houses as planes from their points: houses divided into parts with a plane each (step 2.0)."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -13,6 +13,7 @@ from pipeline.data.roofs import ROOF_METHODS, Roofs, join_roofs, take_roofs
 from pipeline.geometry.group_order import percentile_by_group, sort_points
 from pipeline.geometry.inside import read_rings
 from pipeline.geometry.rings import make_canonical
+from pipeline.roofs.cut_search import find_ridges, order_across
 from pipeline.roofs.families import fit_family
 from pipeline.roofs.house_levels import HouseParts
 from pipeline.roofs.lines import wall_directions
@@ -49,6 +50,10 @@ Array = NDArray[np.float64]
 
 # Parts of a house, their roofs, and where they come from: an index into `ROOF_METHODS`.
 NewRoof = tuple[NDArray[np.object_], Roofs, int]
+
+# Slopes and heights, and limits of the parts of a house; vertices of closed rings, their rings, the part of each
+# ring and whether it is a shell; and whether all planes are of a family.
+_Division = tuple[Array, Array, Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], bool]
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,12 @@ class HouseRoofs:
     too_few: NDArray[np.bool_]
 
 
-def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOptions) -> HouseRoofs:
+def fit_roofs(
+    polygons: NDArray[np.object_],
+    points: RoofPoints,
+    options: RoofOptions,
+    finer: tuple[float, float] | None = None,
+) -> tuple[HouseRoofs, HouseRoofs | None]:
     """Divide houses into parts, each under a plane, by their points and outlines alone.
 
     Parameters
@@ -122,12 +132,16 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
         Their roof points, as from `locate_roof_points`.
     options : RoofOptions
         Thresholds.
+    finer : (float, float), optional
+        Clearance and price of cuts of a second division by the same planes.
 
     Returns
     -------
     HouseRoofs
         Parts in canonical form that cover each house without overlap and share their vertices to the bit; a
         house that is not divided keeps its polygon, to the bit.
+    HouseRoofs or None
+        The second division.
 
     Raises
     ------
@@ -151,6 +165,8 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
     whose best roof is flat: `too_few` tells them apart. O(n k) for n points and k planes of a house, a cut.
     """
     _check(polygons, points, options)
+    second = options if finer is None else replace(options, clearance=finer[0], cut_price=finer[1])
+    _check(polygons, points, second)
     area = shapely.area(polygons)
     bounds = shapely.bounds(polygons).reshape(-1, 4)
     origin = np.floor((bounds[:, :2] + bounds[:, 2:]) / 2)
@@ -162,8 +178,10 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
     xyz = xyz[kept]
     xyz[:, :2] -= np.repeat(origin, np.diff(start), axis=0)
     local = fit_locally(start, xyz, area)
-    fitted = _fit_houses(polygons, origin, start, (xyz, local), np.flatnonzero(~too_few), options)
-    return _assemble(polygons, origin, heights, too_few, fitted)
+    several = (options,) if finer is None else (options, second)
+    fitted = _fit_houses(polygons, origin, start, (xyz, local), np.flatnonzero(~too_few), several)
+    first, *rest = [_assemble(polygons, origin, heights, too_few, one) for one in fitted]
+    return first, rest[0] if rest else None
 
 
 def replace_roofs(fitted: HouseRoofs, new: Mapping[int, NewRoof]) -> HouseRoofs:
@@ -193,6 +211,13 @@ def replace_roofs(fitted: HouseRoofs, new: Mapping[int, NewRoof]) -> HouseRoofs:
     n_planes[rows] = [len(np.unique(roofs.plane, axis=0)) for _, roofs, _ in new.values()]
     parts = HouseParts(pieces[order], house[order])
     return HouseRoofs(parts, take_roofs(roofs, order), method, n_planes, fitted.too_few)
+
+
+def take_roof(fitted: HouseRoofs, row: int) -> NewRoof:
+    """Take the roof of a house, for `replace_roofs`."""
+    first, last = np.searchsorted(fitted.parts.house, [row, row + 1])
+    mine = np.arange(first, last)
+    return fitted.parts.polygons[mine], take_roofs(fitted.roofs, mine), int(fitted.method[row])
 
 
 def _thin_out(start: NDArray[np.int64], share: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -227,31 +252,35 @@ def _fit_houses(
     start: NDArray[np.int64],
     points: tuple[Array, Array],
     rows: NDArray[np.int64],
-    options: RoofOptions,
-) -> list[_FittedHouse]:
-    rings = read_rings(polygons[rows])
+    several: Sequence[RoofOptions],
+) -> list[list[_FittedHouse]]:
+    """Divide the houses of some rows by each of the options, which differ in clearance and price alone."""
+    rings, options = read_rings(polygons[rows]), several[0]
+    levels = np.array([(WALL_ROOM * one.clearance, one.cut_price) for one in several])
     rules = PartRules(
-        WALL_ROOM * options.clearance,
+        math.nan,
         float(options.min_area),
         float(options.min_points),
-        float(options.cut_price),
+        math.nan,
         float(options.min_step),
         float(options.min_kink),
         float(options.max_depth),
     )
-    found = []
+    found: list[list[_FittedHouse]] = [[] for _ in several]
     for k, i in enumerate(rows.tolist()):
         begin, end = rings.start[k], rings.start[k + 1]
         first, last = start[i], start[i + 1]
-        fitted = _fit_house(
+        divisions = _fit_house(
             points[0][first:last],
             points[1][first:last],
             rings.xy[begin:end] - origin[i],
             rings.ring[begin:end],
             rules,
+            levels,
             float(options.max_slope),
         )
-        found.append(_FittedHouse(i, *fitted))
+        for fitted, division in zip(found, divisions, strict=True):
+            fitted.append(_FittedHouse(i, *division))
     return found
 
 
@@ -294,30 +323,51 @@ def _assemble(
 
 @kernel
 def _fit_house(
-    xyz: Array, local: Array, vertices: Array, ring: NDArray[np.int64], rules: PartRules, max_slope: float
-) -> tuple[Array, Array, Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], bool]:
-    """Fit planes to a house.
-
-    Gives slopes and heights, and limits of its parts; vertices of closed rings, their rings, the part of each
-    ring and whether it is a shell; and whether all planes are of a family.
-    """
+    xyz: Array,
+    local: Array,
+    vertices: Array,
+    ring: NDArray[np.int64],
+    rules: PartRules,
+    levels: Array,
+    max_slope: float,
+) -> list[_Division]:
+    """Fit planes to a house, and divide it by the rules with each clearance and price for each m² of `levels`."""
     net = open_subdivision(vertices, ring, len(xyz))
     n_given = net[2][NODES]
     _, a, b = edges_of_face(net[0], net[1], net[2][HALVES], 0)
     density = len(xyz) / area_of_edges(a, b)
     least = max(rules.min_points, density * rules.min_area)
     planes, cost, along, n_family = _find_candidates(xyz, local, a, b, density, least, max_slope)
-    rules = PartRules(
-        rules.clearance,
-        rules.min_area,
-        rules.min_points,
-        rules.price * density,
-        rules.min_step,
-        rules.min_kink,
-        rules.max_depth,
-    )
-    face, area = cut_house(xyz, planes, cost, along, net, rules)
-    region, best = join_faces(planes, cost, face, area, net, rules)
+    lines = (along, find_ridges(planes), *order_across(xyz, along))
+    divisions = []
+    for level in levels:
+        net = open_subdivision(vertices, ring, len(xyz))
+        rules = PartRules(
+            level[0],
+            rules.min_area,
+            rules.min_points,
+            level[1] * density,
+            rules.min_step,
+            rules.min_kink,
+            rules.max_depth,
+        )
+        face, area = cut_house(xyz, cost, lines, net, rules)
+        region, best = join_faces(planes, cost, face, area, net, rules)
+        divisions.append(_take_parts(xyz, (planes, n_family), face, (region, best), net, n_given))
+    return divisions
+
+
+@kernel
+def _take_parts(
+    xyz: Array,
+    planes: tuple[Array, int],
+    face: NDArray[np.int64],
+    joined: tuple[NDArray[np.int64], NDArray[np.int64]],
+    net: tuple[NDArray[np.int64], Array, NDArray[np.int64]],
+    n_given: int,
+) -> _Division:
+    """Make parts of faces that are joined."""
+    region, best = joined
     part = np.empty(len(region), np.int64)
     n_parts = 0
     for f in range(len(region)):
@@ -328,12 +378,10 @@ def _fit_house(
     for f in range(len(region)):
         part[f] = part[region[f]]
         if region[f] == f:
-            of_family &= best[f] < n_family
+            of_family &= best[f] < planes[1]
             for q in range(3):
-                used[part[f], q] = planes[best[f], q]
-    for p in range(len(face)):
-        face[p] = part[face[p]]
-    limits = limit_parts(xyz, face, n_parts, LIMIT_SHARE, LIMIT_ROOM)
+                used[part[f], q] = planes[0][best[f], q]
+    limits = limit_parts(xyz, part[face], n_parts, LIMIT_SHARE, LIMIT_ROOM)
     xy, of_ring, owner, shell = outline_regions(net[0], net[1], net[2], part, n_given)
     return used, limits, xy, of_ring, owner, shell, of_family
 

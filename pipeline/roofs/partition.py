@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
 from pipeline.geometry.inside import INSIDE, side_of
-from pipeline.roofs.cut_search import OPEN, find_rectangle, find_ridges, order_across, rank_cuts, shift_cuts
+from pipeline.roofs.cut_search import OPEN, find_rectangle, rank_cuts, shift_cuts
 from pipeline.roofs.subdivision import (
     FACE,
     FACES,
@@ -56,7 +56,11 @@ class PartRules(NamedTuple):
 
 @kernel
 def cut_house(
-    xyz: Array, planes: Array, cost: Array, along: Array, net: tuple[Index, Array, Index], rules: PartRules
+    xyz: Array,
+    cost: Array,
+    lines: tuple[Array, Array, Array, Index],
+    net: tuple[Index, Array, Index],
+    rules: PartRules,
 ) -> tuple[Index, Array]:
     """Cut the only face of a subdivision until no cut pays.
 
@@ -64,12 +68,10 @@ def cut_house(
     ----------
     xyz : float64, (n, 3)
         Points of the house (m).
-    planes : float64, (k, 3)
-        Planes that parts may have.
     cost : float64, (n, k)
-        Misfit of each point under each.
-    along : float64, (d, 2)
-        Directions of walls.
+        Misfit of each point under each of the planes that parts may have.
+    lines : tuple
+        Along which lines to cut: as for `rank_cuts`.
     net
         As from `open_subdivision`.
     rules : PartRules
@@ -85,7 +87,6 @@ def cut_house(
     half, place, count = net
     face, area = np.zeros(len(xyz), np.int64), np.zeros(len(place))
     depth, todo = np.zeros(len(area), np.int64), np.empty(len(area), np.int64)
-    lines = (along, find_ridges(planes), *order_across(xyz, along))
     _, a, b = edges_of_face(half, place, count[HALVES], 0)
     area[0] = area_of_edges(a, b)
     todo[0], n_todo = 0, 1
@@ -140,7 +141,7 @@ def _cut_piece(
     """Cut a face along the best line, or along the best rectangle if that saves more; tell whether it is cut."""
     half, place, count = net
     xyz, cost, face = points
-    ranked = rank_cuts(xyz, cost, face, piece, lines, least, rules.price)
+    ranked = rank_cuts(xyz, cost, face, rows, lines, least, rules.price)
     saved = ranked[0, 3] + RECTANGLE_BONUS * rules.price if len(ranked) else 0.0
     sides = find_rectangle(xyz, cost, rows, lines[0], least, max(saved, rules.price), rules.clearance)
     cut = False
@@ -162,7 +163,7 @@ def _cut_piece(
             break
         cut = cut_face(half, place, count, piece, (ranked[k, 0], ranked[k, 1], ranked[k, 2]), rules.clearance)
     if not cut and len(ranked):
-        shifted = shift_cuts(points, piece, rows, ranked, least, (MOVED_PRICE * rules.price, rules.clearance))
+        shifted = shift_cuts(xyz, cost, rows, ranked, least, (MOVED_PRICE * rules.price, rules.clearance))
         for k in range(len(shifted)):
             if cut:
                 break
@@ -179,7 +180,9 @@ def join_faces(
 
     Parameters
     ----------
-    planes, cost, net, rules
+    planes : float64, (k, 3)
+        Planes that parts may have.
+    cost, net, rules
         As for `cut_house`.
     face, area
         As from there.

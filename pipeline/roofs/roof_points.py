@@ -83,6 +83,26 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     return make_roof_points(start, xyz)
 
 
+def divide_roof_points(points: RoofPoints, parts: NDArray[np.object_], owner: NDArray[np.int64]) -> RoofPoints:
+    """Deal the points of buildings out to parts of them.
+
+    Parameters
+    ----------
+    points : RoofPoints
+        Points of n buildings.
+    parts : object, (p,)
+        Polygons.
+    owner : int64, (p,)
+        The building that each is a part of: it gets none of the points of others.
+    """
+    n = len(points.start) - 1
+    of_point = np.repeat(np.arange(n), np.diff(points.start))
+    part, point = find_inside(points.xyz, parts, among=np.isin(np.arange(n), owner)[of_point])
+    own = owner[part] == of_point[point]
+    start = np.concatenate(([0], np.cumsum(np.bincount(part[own], minlength=len(parts)))))
+    return make_roof_points(start, points.xyz[point[own]])
+
+
 def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:
     """Keep the points of some buildings, bool (n,).
 

@@ -20,14 +20,14 @@ from pipeline.city_model.city import (
 )
 from pipeline.city_model.groups import adjacent_houses, group_roofs
 from pipeline.city_model.heights import Heights, highest_wall_ground, raise_low_roofs
-from pipeline.city_model.houses import Houses, divide_houses, find_model_roofs
+from pipeline.city_model.houses import Houses, divide_houses, find_fallbacks, find_model_roofs, name_parts
 from pipeline.city_model.model_roofs import MODEL
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
-from pipeline.data.roofs import ROOF_FALLBACKS, Roofs, choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
+from pipeline.data.roofs import Roofs, choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
 from pipeline.points_terrain.terrain import Dtm
-from pipeline.roofs.house_roofs import FLAT, RoofOptions
+from pipeline.roofs.house_roofs import RoofOptions
 from pipeline.roofs.refit import refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, locate_roof_points
 from pipeline.simplification.fidelity import Fidelity, measure_simplification
@@ -36,7 +36,6 @@ from pipeline.simplification.roof_crossings import add_crossings
 
 COVERED = 0.5  # a house without a face is not lost if others cover this part of it
 CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
-NO_POINTS, FEW_POINTS = (ROOF_FALLBACKS.index(why) for why in ("no roof points", "few roof points"))
 SETTLE_ROUNDS = 20  # of grouping roofs and raising them over terrain, in turn
 
 
@@ -188,7 +187,7 @@ def _raise_planar(
 ) -> City:
     """Every house keeps its own faces and points, and its roofs: planes, or one height for each part."""
     row = houses.parts.house[shapes.member]
-    ids = _name_parts(houses.ids, row, reserved)
+    ids = name_parts(houses.ids, row, reserved)
     points = take_building_points(houses.points, shapes.member)
     heights = measure_heights(points, shapes.polygons, dtm, houses.given_height[row], options)
     wall_ground = highest_wall_ground(shapes.polygons, dtm)
@@ -233,7 +232,7 @@ def _raise_planar(
     return replace(
         city,
         roof_method=houses.method[row][city.row],
-        roof_fallback=_find_fallbacks(houses)[row][city.row],
+        roof_fallback=find_fallbacks(houses)[row][city.row],
         roof_form=houses.form[row][city.row],
     )
 
@@ -281,13 +280,6 @@ def _fit_sloped(
     return _Raised(polygons, roofs, None, measured, least, low, counts)
 
 
-def _find_fallbacks(houses: Houses) -> NDArray[np.int8]:
-    """Index into `ROOF_FALLBACKS` of each house."""
-    count = np.bincount(houses.parts.house, np.diff(houses.points.roof_start), len(houses))
-    reason = np.where(houses.too_few, np.where(count > 0, FEW_POINTS, NO_POINTS), 0)
-    return np.where((houses.method == FLAT) & (houses.form < 0), reason, 0).astype(np.int8)
-
-
 def _settle_clusters(
     shapes: Shapes, heights: Heights, wall_ground: NDArray[np.float64], ids: NDArray[np.str_], options: CityOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -316,21 +308,6 @@ def _settle_clusters(
         n_groups[k] = group[rows].max() + 1
     group[order] += np.repeat(np.cumsum(n_groups) - n_groups, count).astype(np.int32)
     return roof, group
-
-
-def _name_parts(ids: NDArray[np.str_], row: NDArray[np.int64], reserved: Set[str]) -> NDArray[np.str_]:
-    """Ids of faces; those of a house of several are numbered, reserved names left out."""
-    count = np.bincount(row, minlength=len(ids))
-    seen = np.zeros(len(ids), np.int64)
-    names = []
-    for k in row.tolist():
-        seen[k] += 1
-        name = str(ids[k])
-        part = name if count[k] == 1 else f"{name}-part{seen[k]}"
-        while count[k] > 1 and part in reserved:
-            part += "-"
-        names.append(part)
-    return np.array(names, dtype=np.str_)
 
 
 def _note_outlines(

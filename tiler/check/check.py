@@ -16,7 +16,7 @@ from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proo
 from tiler.check.check_piece import ANY, GROUND, TOP
 from tiler.check.piece_survey import LoadDtm, PieceTask, Survey, load_survey, survey_piece
 from tiler.check.proofs import Fault, Finding, Proof, Vertices
-from tiler.check.solid_proofs import check_crs, check_solids
+from tiler.check.solid_proofs import check_crs, check_solids, read_outlines
 from tiler.check.zone_proofs import check_zones, prove_sizes_of_zones, read_given_blocks
 from tiler.citymodels.building_index import BuildingIndex, copy_vertices, index_buildings, open_vertices
 from tiler.executors.in_order import check_workers, map_in_order
@@ -161,7 +161,12 @@ def _look(item: tuple[Path, Path] | PieceTask) -> tuple[Proof, ...]:
         earlier = copy_vertices(full, file)
         return (
             check_solids(directory / CITY_MODEL, model),
-            check_solids(full, earlier, title="the city model before simplification"),
+            check_solids(
+                full,
+                earlier,
+                title="the city model before simplification",
+                outlines=read_outlines(directory / STORE),
+            ),
             check_crs({CITY_MODEL: model, FULL_CITY_MODEL: earlier}, read_crs(directory / RUN_RECORD)),
         )
 

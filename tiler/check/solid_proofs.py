@@ -28,6 +28,8 @@ from tiler.citymodels.building_index import (
 from tiler.citymodels.building_index import Vertices as ModelVertices
 from tiler.citymodels.cityjson import BLOCK_HEIGHTS
 from tiler.citymodels.cityjson_text import reference_system
+from tiler.citymodels.tables import unpack_polygons
+from tiler.store.store import Store
 
 TOGETHER = 1024  # buildings that are looked at together
 HEIGHT_STEP = 1e-3  # m: CityJSON rounds coordinates to 1 mm, the heights among the attributes are not rounded
@@ -35,6 +37,8 @@ ROOF_TOLERANCE = LEVEL_TOLERANCE + HEIGHT_STEP  # m, up or down, of a corner of 
 PLAN_TOLERANCE = STRAIGHT + HEIGHT_STEP  # m, in the plane, of a corner under a sloped roof
 PLANARITY = 0.01  # m, of the corners of a face along its normal: what val3dity takes by default
 PARTING = 0.008  # m, from a place where rings of a footprint meet, within which its solid is parted
+ANGLE_STEP = 0.051  # degrees: angles among the attributes are rounded to a tenth
+ROOF_NUMBERS = ("roof_slope", "roof_azimuth", "roof_clipped", "roof_density", "roof_points")
 FLOOR, ROOF, SIDE = KINDS = ("GroundSurface", "RoofSurface", "WallSurface")
 LOD12, LOD13 = BLOCK_HEIGHTS["1.2"], BLOCK_HEIGHTS["1.3"]
 DETAILS = {
@@ -47,6 +51,10 @@ DETAILS = {
     "solid-bent": f"a face of the solid is not plane; bound: {PLANARITY:g} m",
     "solid-semantics": "a face does not look down, up or aside as its semantic surface says",
     "block-height": f"lod13_height is not the mean height of the roof; bound: {ROOF_TOLERANCE:g} m",
+    "roof-attribute": "slope, azimuth, clipped share or density are not those of the roof over its footprint",
+    "house-attribute": "roof_parts, roof_planes or lod12_height of a house is not that of its parts",
+    "parts-overlap": "parts of a house overlap",
+    "parts-outline": "the parts of a house do not cover its outline",
     "height-attribute": f"height is not roof_height less ground_height; bound: {HEIGHT_STEP:g} m",
 }
 
@@ -65,7 +73,38 @@ def check_crs(found: Mapping[str, ModelVertices], crs: str) -> Proof:
     return Proof(f"the {len(stated)} city models name the CRS of run.json, {crs}", faults)
 
 
-def check_solids(path: Path, vertices: ModelVertices, *, title: str = "the city model") -> Proof:
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Outlines of ``n`` houses before they were divided: hashes of ids, ascending, areas (m2) and boxes (m)."""
+
+    key: NDArray[np.int64]
+    size: NDArray[np.float64]
+
+    def find(self, house: str) -> NDArray[np.float64]:
+        """Area and box of a house; NaN for an unknown one."""
+        row = int(np.searchsorted(self.key, _hash_pair(house)))
+        known = row < len(self.key) and self.key[row] == _hash_pair(house)
+        return self.size[row] if known else np.full(5, np.nan)
+
+
+def read_outlines(path: Path) -> Outlines | None:
+    """Read the outlines of houses from the store of a run, tile by tile; None where it has not kept them."""
+    store = Store(path)
+    keys, sizes = [np.empty(0, np.int64)], [np.empty((0, 5))]
+    names = store.names("houses")
+    for name in names:
+        arrays, _ = store.read("houses", name, names=("ids", "outline", "outline_start"))
+        polygons = unpack_polygons(arrays, "outline")
+        keys.append(np.array([_hash_pair(house) for house in arrays["ids"].tolist()], np.int64))
+        sizes.append(np.column_stack((shapely.area(polygons), shapely.bounds(polygons).reshape(-1, 4))))
+    key = np.concatenate(keys)
+    order = np.argsort(key)
+    return Outlines(key[order], np.concatenate(sizes)[order]) if names else None
+
+
+def check_solids(
+    path: Path, vertices: ModelVertices, *, title: str = "the city model", outlines: Outlines | None = None
+) -> Proof:
     """Read the objects of a city model, some at a time, and tell how many solids are right.
 
     Parameters
@@ -76,6 +115,8 @@ def check_solids(path: Path, vertices: ModelVertices, *, title: str = "the city 
         Its vertices.
     title : str
         What the claim calls it.
+    outlines : Outlines, optional
+        What the parts of each house must cover.
 
     Raises
     ------
@@ -87,13 +128,14 @@ def check_solids(path: Path, vertices: ModelVertices, *, title: str = "the city 
     The solid is held against the attributes and the LoD 0 footprint, and these against the mesh by the proofs of
     `tiler.check.city_proofs`: what one of them has otherwise is found.
     """
-    proofs, batch = _Found(), _Batch()
+    proofs, batch = _Found(outlines), _Batch()
     for name, thing in read_objects(path):
         building = None if has_parts(path, thing) else read_building(path, name, thing, vertices)
         try:
             proofs.add_kin(name, thing)
             if building is not None:
                 batch.add(thing, len(vertices), building)
+                proofs.add_part(name, thing, building)
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise InputError(
                 f"city model: building {name!r}: its solid is damaged ({error!r}); run again"
@@ -108,8 +150,10 @@ def check_solids(path: Path, vertices: ModelVertices, *, title: str = "the city 
 class _Found:
     """What is wrong with the solids of a city model."""
 
-    def __init__(self) -> None:
-        self._n_solids = self._n_sloped = self._n_flat = 0
+    def __init__(self, outlines: Outlines | None) -> None:
+        self._outlines = outlines
+        self._parts: dict[str, list[tuple[BuildingRow, Mapping[str, Any]]]] = {}  # of houses, until all are there
+        self._n_houses = self._n_solids = self._n_sloped = self._n_flat = 0
         self._places: dict[str, list[tuple[float, float, float]]] = {}
         self._count: dict[str, int] = {}
         self._kin = [0, 0]  # sums of hashes of (house, part), as houses and as parts have them
@@ -118,18 +162,58 @@ class _Found:
         self._kin[0] += sum(_hash_pair(name, part) for part in thing.get("children", ()))
         self._kin[1] += sum(_hash_pair(house, name) for house in thing.get("parents", ()))
 
+    def add_part(self, name: str, thing: Mapping[str, Any], building: BuildingRow) -> None:
+        """Take a building or part; where all parts of its house are there, look at the house."""
+        values = thing["attributes"]
+        if "parents" in thing and "roof_parts" not in values:
+            return
+        house = thing.get("parents", [name])[0]
+        parts = self._parts.setdefault(house, [])
+        parts.append((building, values))
+        if len(parts) == values.get("roof_parts", 1):
+            self._look_at_house(house, self._parts.pop(house))
+
+    def _look_at_house(self, house: str, parts: list[tuple[BuildingRow, Mapping[str, Any]]]) -> None:
+        self._n_houses += 1
+        shapes = np.array([building.footprint for building, _ in parts], np.object_)
+        area, whole = shapely.area(shapes), shapely.union_all(shapes)
+        slack = HEIGHT_STEP * float(shapely.length(shapes).sum())
+        self._fault("parts-overlap", parts[0][0], whole.area < area.sum() - slack)
+        if self._outlines is not None:
+            wanted = self._outlines.find(house)
+            near = np.abs(np.array(whole.bounds) - wanted[1:]) <= 2 * HEIGHT_STEP
+            wrong = not (abs(whole.area - wanted[0]) <= slack and near.all())
+            self._fault("parts-outline", parts[0][0], wrong)
+        if "roof_parts" in parts[0][1]:
+            sloped = {building.plane for building, _ in parts if any(building.plane[:2])}
+            sloped_planes = {plane[:5] for plane in sloped}
+            flat = [building.roof for building, _ in parts if not any(building.plane[:2])]
+            least, most = len(sloped_planes) + len(set(flat)), len(sloped_planes) + len(flat)
+            mean = (area * [values[LOD13] for _, values in parts]).sum() / area.sum()
+            for building, values in parts:
+                right = values["roof_parts"] == len(parts) and least <= values["roof_planes"] <= most
+                right &= abs(values[LOD12] - mean) <= ROOF_TOLERANCE
+                self._fault("house-attribute", building, not right)
+
+    def _fault(self, kind: str, building: BuildingRow, wrong: bool) -> None:
+        """Count a fault at a building."""
+        places = self._places.setdefault(kind, [])
+        self._count[kind] = self._count.get(kind, 0) + int(wrong)
+        if wrong and len(places) < N_PLACES:
+            place = building.footprint.representative_point()
+            places.append((place.x, place.y, building.roof))
+
     def add(self, batch: "_Batch", vertices: ModelVertices) -> None:
         self._n_flat += batch.n_flat
         self._n_solids += batch.n_solids
         self._n_sloped += sum(batch.sloped)
         for kind, wrong in batch.find_faults(vertices).items():
-            self._count[kind] = self._count.get(kind, 0) + int(wrong.sum())
-            places = self._places.setdefault(kind, [])
-            for k in np.flatnonzero(wrong)[: N_PLACES - len(places)].tolist():
-                place = batch.buildings[k].footprint.representative_point()
-                places.append((place.x, place.y, batch.buildings[k].roof))
+            for k in np.flatnonzero(wrong).tolist():
+                self._fault(kind, batch.buildings[k], True)
 
     def prove(self, title: str) -> Proof:
+        for parts in self._parts.values():
+            self._fault("house-attribute", parts[0][0], True)
         faults = [
             Fault(kind, n, tuple(self._places[kind]), DETAILS[kind])
             for kind, n in sorted(self._count.items())
@@ -139,6 +223,8 @@ class _Found:
             faults.append(Fault("parts", 1, (), "children of houses and parents of parts differ"))
         flat = f", {self._n_flat} flat buildings have none" if self._n_flat else ""
         claim = f"{self._n_solids} solids of {title} are closed and stand from ground to roof{flat}"
+        if self._outlines is not None:
+            claim += f"; the parts of {self._n_houses} houses cover their outlines without overlap"
         bound = f"bound: {HEIGHT_STEP:g} m"
         if self._n_sloped:
             bound += f", {ROOF_TOLERANCE:g} m of the {self._n_sloped} with sloped roofs"
@@ -164,6 +250,8 @@ class _Batch:
         self.sloped: list[bool] = []
         self._height: list[float] = []  # of each building: its attribute
         self._block: list[float] = []  # of each building: its attribute for LoD1.3, or NaN
+        # Of each building: its attributes `ROOF_NUMBERS`, NaN for none
+        self._told: list[tuple[float, ...]] = []
         self._missing: list[bool] = []  # of each building
         self._building: list[int] = []  # of each solid: its building,
         self._top: list[float] = []  # and how high it must be
@@ -179,6 +267,8 @@ class _Batch:
         flat, tops = building.plane[5] == building.plane[6], {"1.2": roof}
         self._height.append(float(attributes.get("height", roof - ground)))
         self._block.append(np.nan)
+        told = (attributes.get(name) for name in ROOF_NUMBERS)
+        self._told.append(tuple(np.nan if value is None else float(value) for value in told))
         if LOD12 in attributes:
             tops = {"1.2": float(attributes[LOD12]), "1.3": float(attributes[LOD13]), "2.2": roof}
             self._block[-1] = tops["1.3"]
@@ -226,14 +316,17 @@ class _Batch:
         # As solids have them: nowhere in the ground, but for flat ones.
         least = np.where(plane[:, 5] < plane[:, 6], ground + ROOM, plane[:, 5])
         over = replace(roofs, limits=np.maximum(roofs.limits, least[:, None]))
-        block, mean = roof.copy(), roof.copy()
-        uneven = np.flatnonzero((plane[:, 5] != plane[:, 6]) & (shapely.area(footprint) > 0))
-        for heights, kind in ((block, roofs), (mean, over)):
-            heights[uneven] = measure_roof_areas(footprint[uneven], take_roofs(kind, uneven)).mean
+        block, mean, clipped = roof.copy(), roof.copy(), np.zeros(n)
+        area = shapely.area(footprint)
+        uneven = np.flatnonzero((plane[:, 5] != plane[:, 6]) & (area > 0))
+        for heights, kind in ((mean, over), (block, roofs)):
+            measured = measure_roof_areas(footprint[uneven], take_roofs(kind, uneven))
+            heights[uneven], clipped[uneven] = measured.mean, measured.at_low + measured.at_high
         blocks = np.array(self._block)
         found = {
             "height-attribute": ~(np.abs(np.array(self._height) - (roof - ground)) <= HEIGHT_STEP),
             "block-height": ~np.isnan(blocks) & ~(np.abs(blocks - block) <= ROOF_TOLERANCE),
+            "roof-attribute": self._find_other_roofs(plane, clipped, area, shapely.length(footprint)),
             "solid-missing": np.array(self._missing),
         }
         if self._top:
@@ -241,6 +334,25 @@ class _Batch:
             shell = _Shells(footprint, building, ground[building], np.array(self._top), np.array(self.sloped))
             faults = _find_faults(self._read(vertices), shell, over, mean[building])
             found |= {kind: _any(building[wrong], n) for kind, wrong in faults.items()}
+        return found
+
+    def _find_other_roofs(
+        self,
+        plane: NDArray[np.float64],
+        clipped: NDArray[np.float64],
+        area: NDArray[np.float64],
+        length: NDArray[np.float64],
+    ) -> Mask:
+        """Tell which buildings state other numbers of their roof than their plane and footprint give."""
+        slope, azimuth, share, density, points = np.array(self._told).T
+        east, north = plane[:, :2].T
+        rounded, slack = 0.5 * HEIGHT_STEP, HEIGHT_STEP * length
+        around = (np.degrees(np.arctan2(-east, -north)) - azimuth + 180) % 360 - 180
+        wrong = np.abs(np.degrees(np.arctan(np.hypot(east, north))) - slope) > ANGLE_STEP
+        wrong |= np.where(plane[:, :2].any(axis=1), ~(np.abs(around) <= ANGLE_STEP), ~np.isnan(azimuth))
+        wrong |= np.abs(share * area - clipped) > rounded * area + slack
+        wrong |= np.abs(density * area - points) > (rounded * area + density * slack)
+        found: Mask = wrong & ~np.isnan(slope)
         return found
 
     def _read(self, vertices: ModelVertices) -> "_Solids":
@@ -407,5 +519,6 @@ def _are_near(met: Mapping[int, Vertices], row: NDArray[np.int64], places: Verti
     return near
 
 
-def _hash_pair(house: str, part: str) -> int:
-    return int.from_bytes(hashlib.blake2b(f"{house}\n{part}".encode(), digest_size=8).digest(), "big")
+def _hash_pair(house: str, part: str = "") -> int:
+    digest = hashlib.blake2b(f"{house}\n{part}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "big", signed=True)

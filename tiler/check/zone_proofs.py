@@ -228,17 +228,20 @@ class _Found:
         Also tells of which rows this outline lies in a cell that blocks stand for.
         """
         within, blocks, of_house = np.zeros(len(rows), np.bool_), list[Any](), dict[str, list[int]]()
-        cells, kept = shapely.STRtree([] if self._blocks is None else self._blocks.cells), within.copy()
+        cells = shapely.STRtree([] if self._blocks is None else self._blocks.cells)
+        known, kept = within.copy(), ~within  # of which rows the house is there; all of its parts lie in cells
         for row, name in enumerate(self._names):
             of_house.setdefault(name, []).append(row)
 
-        for name, _, building in _iterate(full_model):
-            if mine := of_house.get(name):
-                within[mine] = shapely.dwithin(building.footprint, shapely.points(rows[mine, :2]), WITHIN)
-                kept[mine] = self._lies_in_cell(name, building.footprint, cells)
+        for name, thing, building in _iterate(full_model):
+            house = thing.get("parents", [name])[0]
+            if mine := of_house.get(house):
+                within[mine] |= shapely.dwithin(building.footprint, shapely.points(rows[mine, :2]), WITHIN)
+                known[mine] = True
+                kept[mine] &= self._lies_in_cell(house, building.footprint, cells)
                 if rows[mine[0], 3] > BLOCK:
                     blocks.append(building.footprint)
-        return within, blocks, kept
+        return within, blocks, known & kept
 
     def _lies_in_cell(self, name: str, outline: shapely.Geometry, cells: shapely.STRtree) -> bool:
         """Whether a house lies in a cell, so that its point did: no part of a footprint, which has more places."""

@@ -35,7 +35,7 @@ _EMPTY_LAZ = 1000  # what follows the header of a LAZ file without points is sho
 _POINTS = laspy.PointFormat(3)
 
 
-class _Header(laspy.LasHeader):
+class _Header(laspy.LasHeader):  # type: ignore[misc]  # laspy has no types
     """A header to be filled by `read_from`: laspy makes it with a deep copy of a format, half of the time."""
 
     def __init__(self) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.city_model.building_points import reach_of_points
 from pipeline.city_model.city import City, CityOptions, find_places
 from pipeline.city_model.city_steps import measure_city, prepare_footprints
+from pipeline.city_model.full_model import divide_city
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.houses import (
     Houses,
@@ -104,12 +105,13 @@ def house_stage(config: Config) -> Stage:
         Read("outlines", own=True),
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
+        Read("reserved"),
     )
     models = ("buildings_given", "ground_of_models", "prefer") if config.buildings else ()
     finer = FINER_PARAMETERS if config.keeps_model_roofs else ()
     blocks = BLOCK_PARAMETERS if config.has_blocks else ()
     parameters = (*CITY_PARAMETERS, *TERRAIN, *models, *finer, *blocks)
-    return Stage("houses", Scope.TILE, make_houses, reads, parameters, version=6)
+    return Stage("houses", Scope.TILE, make_houses, reads, parameters, version=7)
 
 
 def first_round(config: Config) -> list[Stage]:
@@ -233,11 +235,13 @@ def make_houses(task: Task) -> Facts:
             unmarked=others | told,
             surfaces=surfaces,
             prefer_points=task.parameters.get("prefer", "model") == "points",
+            full=True,
         )
     del cloud  # large, and no longer needed
-    with task.step("1.7 fit of roofs"):
-        fidelity = measure_houses(roofs, city.model.polygons, city.model.roofs)
-        full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
+    with task.step("1.7 full city model"):
+        divided, roofs = divide_city(city, houses, roofs, reserved=_reserved(task))
+        fidelity = measure_houses(roofs, divided.model.polygons, divided.model.roofs)
+        full = make_buildings(divided, fidelity, np.zeros(len(divided.model), np.int32))
     task.notes(houses.notes)
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
     if blocks:
@@ -406,7 +410,6 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     shapes = _keep_within(task, shapes, gathered.houses)
     extent = extent_of(shapes.polygons)
     dtm = _terrain_around(task, extent, reach + 2 * given.dtm_spacing)
-    reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
     terrain = cut_terrain(dtm, window_of(dtm))
     cloud = points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
     with task.step("2.3 roof points"):
@@ -419,7 +422,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
         told[_find_of_all(shapes, gathered, gathered.told)] = True
         roofs = leave_out_points(roofs, told)
     city = raise_buildings(
-        gathered.houses, shapes, terrain, options, reserved=reserved, roof_points=roofs, trace=task.step
+        gathered.houses, shapes, terrain, options, reserved=_reserved(task), roof_points=roofs, trace=task.step
     )
     stated = gathered.houses.ids[gathered.told | (gathered.block >= 0)]
     task.notes(_of_buildings(city.notes, city.model.ids[np.isin(city.model.house, stated)]))
@@ -491,6 +494,11 @@ def _keep_within(task: Task, shapes: Shapes, houses: Houses) -> Shapes:
         x, y = shapely.get_coordinates(shapely.point_on_surface(shapes.polygons[row]))[0].tolist()
         task.note(Note("building-beyond-region", ", ".join(ids), x, y, "its simplified outline leaves the region"))
     return keep_shapes(shapes, within)
+
+
+def _reserved(task: Task) -> set[str]:
+    """Read the ids that no part of a house may get."""
+    return {name for result in task.read("reserved", ()) for name in result.facts["names"]}
 
 
 def _owned(task: Task, footprints: Footprints) -> Footprints:

@@ -40,7 +40,7 @@ def city_model_stages(config: Config) -> list[Stage]:
     """Stages that write the city models."""
     zones = ZONE_PARAMETERS if config.zoned else ()
     return [
-        Stage("citymodel-full", Scope.REGION, write_full_model, (Read("houses"),)),
+        Stage("citymodel-full", Scope.REGION, write_full_model, (Read("houses"),), version=2),
         Stage("citymodel", Scope.REGION, write_simple_model, (Read("model"),), zones),
     ]
 
@@ -52,10 +52,7 @@ def write_full_model(task: Task) -> Facts:
 
 def write_simple_model(task: Task) -> Facts:
     """Write the simplified city model (step 2.4)."""
-    fits = RoofFits()
-    facts = _write(task, "model", "", CITY_MODEL, fits)
-    table = fits.by_method()
-    return facts | ({"roof_fit": table, "worst_roofs": fits.worst} if table else {})
+    return _write(task, "model", "", CITY_MODEL)
 
 
 def house_cells(model: CityModel) -> NDArray[np.int64]:
@@ -109,7 +106,8 @@ class _Survey:
     high: float
 
 
-def _write(task: Task, stage: str, prefix: str, file: str, fits: RoofFits | None = None) -> Facts:
+def _write(task: Task, stage: str, prefix: str, file: str) -> Facts:
+    fits = RoofFits()
     with task.step("survey"):
         survey = _survey(task, stage, prefix)
         _check_numbers(task, stage, prefix, survey)
@@ -119,7 +117,10 @@ def _write(task: Task, stage: str, prefix: str, file: str, fits: RoofFits | None
     with task.step("write"), task.output() as out:
         task.notes(write_city_blocks(out / file, blocks, crs=task.context.crs, bounds=bounds))
         written = state_files(out, [out / file])
-    return {"n": len(survey.number), FILES: written}
+    table = fits.by_method()
+    return {"n": len(survey.number), FILES: written} | (
+        {"roof_fit": table, "worst_roofs": fits.worst} if table else {}
+    )
 
 
 def _survey(task: Task, stage: str, prefix: str) -> _Survey:
@@ -203,15 +204,15 @@ def _by_cell(task: Task, stage: str, prefix: str, survey: _Survey) -> Iterator[B
         )
 
 
-def describe_buildings(buildings: Buildings, fits: RoofFits | None) -> Attributes:
-    """Give the attributes of buildings; with `fits`, which they are added to, those of their roofs too."""
+def describe_buildings(buildings: Buildings, fits: RoofFits) -> Attributes:
+    """Give the attributes of buildings, and add their roofs to `fits`."""
     told: dict[str, Sequence[object]] = report_buildings(
         buildings.model, buildings.roof_source, buildings.measured_roof, buildings.fidelity
     )
     if (buildings.level >= 0).any():
         told |= {LOD: [LEVELS[level] for level in buildings.level.tolist()], LOD_POINT: buildings.place.tolist()}
     method, fallback = buildings.roof_method, buildings.roof_fallback
-    if fits is not None and (method != NOT_FITTED).any():
+    if (method != NOT_FITTED).any():
         roofs = describe_roofs(buildings.model, method, fallback, buildings.roof_form, buildings.fidelity)
         fits.add(buildings.model, method, buildings.fidelity, roofs)
         told |= roofs

@@ -25,7 +25,7 @@ def one(polygon: shapely.Polygon) -> NDArray[np.object_]:
 
 
 def fit(polygon: shapely.Polygon, xyz: Array, options: RoofOptions = OPTIONS) -> HouseRoofs:
-    return fit_roofs(one(polygon), make_roof_points(np.array([0, len(xyz)]), xyz), options)
+    return fit_roofs(one(polygon), make_roof_points(np.array([0, len(xyz)]), xyz), options)[0]
 
 
 def heights_at(found: HouseRoofs, xy: Array) -> Array:
@@ -142,11 +142,11 @@ def test_a_part_may_lie_around_another_one() -> None:
 
 def test_the_order_of_points_does_not_matter() -> None:
     polygons, points = town_of_slopes(8, density=5)
-    found = fit_roofs(polygons, points, OPTIONS)
+    found, _ = fit_roofs(polygons, points, OPTIONS)
     rng = np.random.default_rng(3)
     owner = np.repeat(np.arange(8), np.diff(points.start))
     order = np.lexsort((rng.random(len(owner)), owner))
-    again = fit_roofs(polygons, make_roof_points(points.start, points.xyz[order]), OPTIONS)
+    again, _ = fit_roofs(polygons, make_roof_points(points.start, points.xyz[order]), OPTIONS)
     assert_same(again, found)
     check_cover(found, polygons)
 
@@ -161,7 +161,7 @@ def assert_same(one: HouseRoofs, other: HouseRoofs) -> None:
 
 def test_a_house_is_roofed_alike_whatever_houses_are_with_it() -> None:
     polygons, points = town_of_slopes(8, density=5)
-    found = fit_roofs(polygons, points, OPTIONS)
+    found, _ = fit_roofs(polygons, points, OPTIONS)
     for k in (2, 6):
         first, last = points.start[k], points.start[k + 1]
         alone = fit(polygons[k], points.xyz[first:last])
@@ -199,11 +199,11 @@ def test_few_points_make_one_flat_roof_and_are_told() -> None:
 
 def test_no_points_and_no_houses() -> None:
     polygons = np.array([shapely.box(0, 0, 10, 10), shapely.box(20, 0, 30, 10)], object)
-    found = fit_roofs(polygons, no_roof_points(2), OPTIONS)
+    found, _ = fit_roofs(polygons, no_roof_points(2), OPTIONS)
     assert found.too_few.all()
     assert found.parts.polygons.tolist() == polygons.tolist()
     assert np.isnan(found.roofs.plane[:, 2]).all()
-    nothing = fit_roofs(polygons[:0], no_roof_points(0), OPTIONS)
+    nothing, _ = fit_roofs(polygons[:0], no_roof_points(0), OPTIONS)
     assert len(nothing.parts.polygons) == len(nothing.roofs) == len(nothing.method) == 0
 
 

@@ -42,7 +42,7 @@ def test_fitted_roofs_are_the_true_ones(density: float) -> None:
     x, y = ORIGIN
     cloud = city_points(city, (x, y, x + 250, y + 250), (0, 0))
     points = locate_roof_points(cloud, city.polygons, building_class=True)
-    fitted = fit_roofs(city.polygons, points, RoofOptions(clearance=1.0))
+    fitted, _ = fit_roofs(city.polygons, points, RoofOptions(clearance=1.0))
     covered = np.bincount(shapely.STRtree(city.polygons).query(city.polygons, "overlaps")[0], minlength=90) > 0
     for kind, (name, (most, least)) in enumerate(BARS.items()):
         assert ROOF_TYPES[kind] == name

@@ -1,8 +1,10 @@
 """Tests of `citystitch check` on sloped roofs: what it finds where they or their walls are wrong."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,9 @@ from tests.helpers.meshes import PlaneDtm, TinyCity, edit_json, write_run
 from tests.helpers.sloped_towns import BOUNDS, OPTIONS, SlopedTown, sloped_town
 from tiler.check.check import CheckReport, check_run
 from tiler.check.roof_proofs import are_above_roofs
+from tiler.check.solid_proofs import check_solids, read_outlines
+from tiler.citymodels.building_index import copy_vertices
+from tiler.store.out_folder import FULL_CITY_MODEL, STORE
 from tiler.store.run_folder import ROOF_MOVED, Buildings, RoofRules
 
 
@@ -226,3 +231,48 @@ def test_a_house_that_lost_its_walls(tmp_path: Path, town: SlopedTown, mesh: Col
     write_run(tmp_path / "less", city)
     (tmp_path / "less" / "run.json").write_text((tmp_path / "run.json").read_text())
     assert {"building-without-wall", "facet-missing"} <= kinds(check(tmp_path / "less", town))
+
+
+def test_the_full_city_model_has_the_outlines_and_attributes_of_its_parts(
+    sloped_run: Path, tmp_path: Path
+) -> None:
+    """Each number of a part or house that is another one, and a part that is moved or gone, is found."""
+    outlines = read_outlines(sloped_run / STORE)
+    text = (sloped_run / FULL_CITY_MODEL).read_text()
+    things = json.loads(text)["CityObjects"]
+    name, part = next(
+        (k, one) for k, one in things.items() if "parents" in one and one["attributes"]["roof_slope"]
+    )
+    assert len(things[part["parents"][0]]["children"]) == part["attributes"]["roof_parts"] > 1
+
+    def faults(change: Callable[[dict[str, Any]], None]) -> set[str]:
+        model = json.loads(text)
+        change(model)
+        path = tmp_path / FULL_CITY_MODEL
+        path.write_text(json.dumps(model))
+        with TemporaryFile() as file:
+            found = check_solids(path, copy_vertices(path, file), outlines=outlines)
+        return {fault.kind for fault in found.faults}
+
+    def add(attribute: str, by: float) -> Callable[[dict[str, Any]], None]:
+        return lambda model: model["CityObjects"][name]["attributes"].update(
+            {attribute: part["attributes"][attribute] + by}
+        )
+
+    def move(model: dict[str, Any]) -> None:
+        ring = model["CityObjects"][name]["geometry"][0]["boundaries"][0][0]
+        x, y, z = model["vertices"][ring[0]]
+        (xmin, xmax), *_ = np.sort([model["vertices"][k] for k in ring], axis=0)[[0, -1]].T
+        model["vertices"].append([x + 300 * (1 if x > (xmin + xmax) / 2 else -1), y, z])
+        ring[0] = len(model["vertices"]) - 1
+
+    def drop(model: dict[str, Any]) -> None:
+        del model["CityObjects"][name]
+
+    assert faults(lambda model: None) == set()
+    for attribute, by in (("slope", 0.2), ("azimuth", 0.2), ("clipped", 0.1), ("density", 0.2), ("points", 3)):
+        assert faults(add(f"roof_{attribute}", by)) == {"roof-attribute"}
+    for attribute, by in (("roof_parts", -1), ("roof_planes", 2), ("lod12_height", 0.02)):
+        assert "house-attribute" in faults(add(attribute, by))
+    assert faults(move) & {"parts-outline", "parts-overlap"}
+    assert faults(drop) >= {"house-attribute"}
