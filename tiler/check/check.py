@@ -19,6 +19,7 @@ from tiler.check.proofs import Fault, Finding, Proof, Vertices
 from tiler.check.solid_proofs import check_crs, check_solids, read_outlines
 from tiler.check.zone_proofs import check_zones, prove_sizes_of_zones, read_given_blocks
 from tiler.citymodels.building_index import BuildingIndex, copy_vertices, index_buildings, open_vertices
+from tiler.executors.dask_settings import FREED, start_fork_server
 from tiler.executors.in_order import check_workers, map_in_order
 from tiler.mesh_files.mesh_parts import report_parts
 from tiler.mesh_files.vtk_files import read_piece_paths
@@ -113,10 +114,7 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
     need(directory, IN_PIECES)
     record = read_run_record(directory / RUN_RECORD)
     if workers:
-        from tiler.executors.dask_settings import ENVIRONMENT, FREED, start_fork_server
-
-        # It imports what workers need while buildings are read here.
-        start_fork_server(__name__, environment={**ENVIRONMENT, **FREED})
+        start_fork_server()  # which imports what workers need while buildings are read here
     with (
         TemporaryDirectory(prefix="citystitch-") as folder,
         index_buildings(directory / CITY_MODEL, Path(folder)) as index,
@@ -128,7 +126,7 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
         ]
         items: list[tuple[Path, Path] | PieceTask] = [(directory, Path(folder)), *tasks]
         sums, frontier = _Sums.start(len(index)), start_frontier()
-        looks = map_in_order(_look, items, workers)
+        looks = map_in_order(_look, items, workers, malloc=FREED)
         models = next(looks)
         for number, (task, _) in enumerate(zip(tasks, looks, strict=True)):
             survey = load_survey(task.out)

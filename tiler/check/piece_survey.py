@@ -120,6 +120,7 @@ def survey_piece(task: PieceTask) -> None:
     )
     with open_index(task.shared) as index:
         survey = _survey(piece, run, index)
+    run.dtm.sample(np.empty((0, 2)))  # the next piece has another window of the terrain
     task.out.write_bytes(pickle.dumps(survey))
 
 

@@ -182,6 +182,14 @@ def _run_config(
     return code
 
 
+def _start_workers_with(module: str, workers: int) -> None:
+    """Let workers to come import a module instead of all that a run needs."""
+    from tiler.executors.dask_settings import start_fork_server
+
+    if workers:
+        start_fork_server(module)
+
+
 def _collect_seldom() -> None:
     """Look for cycles of objects seldom: imports and tasks leave next to none."""
     from tiler.executors.dask_settings import GARBAGE
@@ -222,6 +230,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _check_folder(directory: Path, workers: int = 0) -> int:
+    _start_workers_with("tiler.check.check", workers)
     from tiler.check.check import check_run
     from tiler.store.results import StoredTerrain
 
@@ -394,6 +403,7 @@ def _write_given(
 
 
 def _write_city(directory: Path, options: argparse.Namespace, workers: int = 0) -> "SynthFiles":
+    _start_workers_with("tiler.interface.synth", workers)
     from tiler.interface.synth import write_city
 
     files = write_city(

@@ -70,7 +70,7 @@ LOCAL: Mapping[str, Any] = {
 PRELOADED = ("distributed.nanny", "tiler.executors.local_cluster")
 OF_RUN = "tiler.planning.own_stages"  # imports what tasks of a run need
 # Of workers whose tasks take arrays of many sizes, each a few times: what is freed goes back at once.
-FREED: Mapping[str, int] = {"MALLOC_TRIM_THRESHOLD_": 2**24, "MALLOC_MMAP_THRESHOLD_": 2**19}
+FREED: Mapping[str, int] = {**ENVIRONMENT, "MALLOC_TRIM_THRESHOLD_": 2**24, "MALLOC_MMAP_THRESHOLD_": 2**19}
 
 
 def as_variables(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -84,21 +84,21 @@ def as_variables(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {"DASK_" + name.upper().replace(".", "__").replace("-", "_"): value for name, value in settings.items()}
 
 
-def keep_memory() -> None:
-    """Apply the settings of malloc of `ENVIRONMENT` to this process, which runs tasks itself; with glibc alone."""
+def keep_memory(environment: Mapping[str, int] = ENVIRONMENT) -> None:
+    """Apply the settings of malloc to this process, which runs tasks itself; with glibc alone."""
     choose = getattr(ctypes.CDLL(None), "mallopt", None)
     if choose is not None:
         for name, number in MALLOPT.items():
-            choose(number, ENVIRONMENT[name])
+            choose(number, environment[name])
 
 
-def start_fork_server(module: str = OF_RUN, *, environment: Mapping[str, int] = ENVIRONMENT) -> None:
+def start_fork_server(module: str = OF_RUN) -> None:
     """Start Python's fork server in the background: it imports `PRELOADED` and a module once for all workers.
 
-    A second call does nothing. `environment` is set in this process, as Dask's nanny does it with `ENVIRONMENT`.
+    A second call does nothing. `ENVIRONMENT` is set in this process, as Dask's nanny does it too.
     """
     if METHOD == "forkserver":
-        for name, value in environment.items():
+        for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, str(value))
         forkserver.set_forkserver_preload([*PRELOADED, module])
         forkserver.ensure_running()

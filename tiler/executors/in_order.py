@@ -1,12 +1,13 @@
 """A function of each of many items, on workers of this machine, with results in the order of the items."""
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from typing import Any, TypeVar
 
 from pipeline.data.errors import ConfigError
 from tiler.engine.task_limits import Limits, share_memory
 from tiler.executors.dask_executor import ClusterError
+from tiler.executors.dask_settings import ENVIRONMENT
 
 AHEAD = 4  # items for each worker that are submitted before the first of them is taken
 
@@ -20,7 +21,13 @@ def check_workers(workers: int) -> None:
         raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
 
 
-def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Generator[Result]:
+def map_in_order(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    workers: int,
+    *,
+    malloc: Mapping[str, int] = ENVIRONMENT,
+) -> Generator[Result]:
     """Call a function with each item and give small results in order.
 
     Parameters
@@ -31,6 +38,8 @@ def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], work
         Small, too: arrays belong into files.
     workers : int
         Number of processes; with 0 it is called here, without Dask.
+    malloc : mapping of str to int
+        Settings of malloc in these, as `ENVIRONMENT` has them.
 
     Raises
     ------
@@ -44,8 +53,7 @@ def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], work
 
     from tiler.executors.local_cluster import open_cluster
 
-    module = getattr(function, "func", function).__module__
-    with open_cluster(workers, Limits(memory=share_memory(workers)), module=module) as (client, _):
+    with open_cluster(workers, Limits(memory=share_memory(workers)), malloc=malloc) as (client, _):
         waiting: deque[Any] = deque()
         try:
             for item in items:

@@ -4,7 +4,7 @@ import gc
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -15,7 +15,7 @@ from tiler.config.config import ANYWHERE
 from tiler.engine.executor import Executor
 from tiler.engine.task_limits import REFUSE_AT, Limits, limit_memory, share_memory
 from tiler.executors.dask_executor import DaskExecutor
-from tiler.executors.dask_settings import GARBAGE, LOCAL, OF_RUN, start_fork_server
+from tiler.executors.dask_settings import ENVIRONMENT, GARBAGE, LOCAL, keep_memory, start_fork_server
 
 
 class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
@@ -25,12 +25,14 @@ class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no typ
     ----------
     memory : int
         Memory that the process may take (bytes); 0 for no limit.
+    malloc : mapping of str to int
+        Settings of malloc, as `ENVIRONMENT` has them.
     """
 
     name = "citystitch"
 
-    def __init__(self, memory: int) -> None:
-        self._memory = memory
+    def __init__(self, memory: int, malloc: Mapping[str, int] = ENVIRONMENT) -> None:
+        self._memory, self._malloc = memory, malloc
 
     def setup(self, worker: Any) -> None:
         """Ignore Ctrl-C, at which the driver lets running tasks end; collect garbage seldom; limit the memory."""
@@ -38,6 +40,8 @@ class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no typ
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         gc.freeze()
         gc.set_threshold(GARBAGE)
+        if self._malloc != ENVIRONMENT:
+            keep_memory(self._malloc)
         if self._memory:
             limit_memory(self._memory)
 
@@ -67,10 +71,10 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
 
 @contextmanager
 def open_cluster(
-    workers: int, limits: Limits, *, dashboard: str = ANYWHERE, module: str = OF_RUN
+    workers: int, limits: Limits, *, dashboard: str = ANYWHERE, malloc: Mapping[str, int] = ENVIRONMENT
 ) -> Iterator[tuple[Any, Any]]:
-    """Start a scheduler and workers that have a module, and end them with the context: client and cluster."""
-    start_fork_server(module)
+    """Start a scheduler and worker processes, and end them with the context: client and cluster."""
+    start_fork_server()
     with (
         config.set(dict(LOCAL)),
         LocalCluster(
@@ -84,7 +88,7 @@ def open_cluster(
         ) as cluster,
         Client(cluster) as client,
     ):
-        client.register_plugin(WorkerSetup(int(REFUSE_AT * limits.memory)))
+        client.register_plugin(WorkerSetup(int(REFUSE_AT * limits.memory), malloc))
         try:
             yield client, cluster
         except KeyboardInterrupt:  # at once: running tasks are not waited for

@@ -69,8 +69,12 @@ class StoredTerrain:
         self._last: Dtm | None = None
 
     def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
-        """Ground height (m) at each place, (n, 2) to (n,). Memory is that of the terrain around them."""
+        """Ground height (m) at each place, (n, 2) to (n,).
+
+        Memory is that of the terrain around them; at no place, that around earlier ones is let go.
+        """
         if len(xy) == 0:
+            self._last = None
             return np.empty(0)
         low, high = xy.min(axis=0), xy.max(axis=0)
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
