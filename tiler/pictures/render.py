@@ -45,7 +45,7 @@ MOST_SHADED = 10_000.0  # m; in a larger region a house is below a pixel, and th
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
 AT_ONCE = 600_000  # pixels of a picture that are drawn at a time, or as many as darken each other
-BLURRED = 4
+BLURRED = 4  # rows of the shade that VTK makes one
 SHADE = 16  # places around each pixel drawn that may darken it
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
 LEAST_TRIANGLE = 3.0  # pixels that the middle triangle's edges need in the picture of sizes for lines to be drawn
@@ -223,7 +223,7 @@ def draw_city(
     zoom = max(1.0, extent / CLOSE) if close else 1.0
     # The legend of quality gives the colours as they are.
     dark = max(OCCLUSION_RADIUS, extent / 100) if extent < MOST_SHADED and colours != "quality" else 0.0
-    beside = SAMPLES * math.ceil(dark / extent * zoom * size[0])
+    beside = SAMPLES * math.ceil(dark / extent * zoom * size[0]) + 2 * BLURRED if dark else 0
     rows = max(SAMPLES * (AT_ONCE // SAMPLES**2 // size[0]), 4 * beside)
     whole = colours == "quality" or rows > size[1] * SAMPLES / 2
     with _plotter(size, rows=None if whole else rows) as plotter:

@@ -5,8 +5,10 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from distributed import get_worker
@@ -17,7 +19,8 @@ from tests.tiler.engine.test_engine import grid_layout, make, wait_until
 from tiler.engine.stage import Facts, Scope, Stage
 from tiler.engine.task import Task
 from tiler.engine.task_limits import TRIM_AT, Limits, resident_memory
-from tiler.executors.dask_settings import ENVIRONMENT, GARBAGE, METHOD
+from tiler.executors.dask_settings import ENVIRONMENT, FREED, GARBAGE, METHOD
+from tiler.executors.in_order import map_in_order
 from tiler.executors.local_cluster import local
 
 
@@ -47,6 +50,23 @@ def test_workers_are_forked_with_their_settings(tmp_path: Path) -> None:
         "frozen": True,
         "sampled": [],
     }
+
+
+def keep_of_freed(n: int) -> int:
+    """Take arrays of some megabytes and let them go; gives the bytes that the process holds on to."""
+    before = resident_memory()
+    taken = [np.ones(n, np.uint8) for _ in range(40)]
+    assert resident_memory() - before > 30 * n
+    del taken
+    return resident_memory() - before
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("malloc", "least", "most"), [(ENVIRONMENT, 30, 41), (FREED, -1, 2)])
+def test_workers_keep_freed_memory_unless_they_are_told(malloc: Mapping[str, int], least: int, most: int) -> None:
+    n = 4 * 2**20
+    (kept,) = map_in_order(keep_of_freed, [n], 1, malloc=malloc)
+    assert least * n < kept < most * n
 
 
 @pytest.mark.long

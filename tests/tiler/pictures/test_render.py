@@ -138,6 +138,17 @@ def test_the_overview_has_both_halves(run: Path, tmp_path: Path) -> None:
     assert blue(left).mean() < 0.002
 
 
+def test_a_picture_in_strips_is_the_one_drawn_at_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    city = load_city(run)
+    city = replace(city, points=10 * city.points)
+    whole = draw_city(city, SIZE).astype(np.int64)
+    monkeypatch.setattr(render, "AT_ONCE", 1)
+    strips = draw_city(city, SIZE).astype(np.int64)
+    difference = np.abs(strips - whole).max(axis=2)
+    assert difference.mean() < 3, "the shade has a pattern of 4 pixels"
+    assert difference.mean(axis=1).max() < 6
+
+
 def test_a_picture_has_a_size_of_its_own(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SIZES, "boundary", (64, 41))
     render_run(run, tmp_path / "out.png")
