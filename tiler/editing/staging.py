@@ -30,10 +30,12 @@ def link_folder(source: Path, target: Path) -> None:
         If there are no hard links between the two: they must lie on one disk.
     """
     with disk_errors(target):
-        for name in _files(source):
-            place = target / name
-            place.parent.mkdir(parents=True, exist_ok=True)
-            os.link(source / name, place)
+        folders = set[str]()
+        for name, _ in _files(source):
+            if (folder := os.path.dirname(f"{target}/{name}")) not in folders:
+                os.makedirs(folder, exist_ok=True)
+                folders.add(folder)
+            os.link(f"{source}/{name}", f"{target}/{name}")
 
 
 def begin(directory: Path) -> Path:
@@ -50,9 +52,9 @@ def commit(directory: Path) -> int:
     are left.
     """
     work = directory / STAGING / WORK
-    new, old = set(_files(work)), set(_files(directory))
-    changed = [name for name in new if name not in old or not os.path.samefile(work / name, directory / name)]
-    listed = {"move": sorted(set(changed) - {CONFIG}), "remove": sorted(old - new - {CONFIG})}
+    new, old = dict(_files(work)), dict(_files(directory))
+    changed = [name for name, inode in new.items() if old.get(name) != inode]
+    listed = {"move": sorted(set(changed) - {CONFIG}), "remove": sorted(old.keys() - new.keys() - {CONFIG})}
     with disk_errors(directory), replacing(directory / STAGING / COMMIT, durable=True) as part:
         part.write_text(json.dumps(listed))
     _move(directory)
@@ -101,13 +103,16 @@ def _move(directory: Path) -> None:
         shutil.rmtree(directory / DONE)
 
 
-def _files(folder: Path) -> Iterator[str]:
-    """List the files of a run, by their paths below its folder."""
-    for top in {*RESULTS, JOURNAL} - OWN:
-        place = folder / top
-        if place.is_file():
-            yield top
-        elif place.is_dir():
-            for path in place.rglob("*"):
-                if path.is_file():
-                    yield path.relative_to(folder).as_posix()
+def _files(folder: Path) -> Iterator[tuple[str, int]]:
+    """List the files of a run, by their paths below its folder, with their inodes."""
+    waiting = [name for name in sorted({*RESULTS, JOURNAL} - OWN) if (folder / name).exists()]
+    for name in waiting:  # which grows
+        if not os.path.isdir(f"{folder}/{name}"):
+            yield name, os.stat(f"{folder}/{name}").st_ino
+            continue
+        with os.scandir(f"{folder}/{name}") as entries:
+            for entry in entries:
+                if entry.is_dir():
+                    waiting.append(f"{name}/{entry.name}")
+                else:
+                    yield f"{name}/{entry.name}", entry.inode()

@@ -4,16 +4,30 @@ import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any, TypeVar
 
 from tiler.objects.places import in_bucket
 
 Found = TypeVar("Found")
-# By device, inode and what is looked for: size and time of the file, and what was found. A file that takes the
-# inode of one that is gone takes its place here too, so a process keeps no more than there are files.
-Known = dict[tuple[object, ...], tuple[tuple[int, int], bytes]]
-_KNOWN: ContextVar[Known | None] = ContextVar("known", default=None)
+MOST = 2**28  # bytes of all that is remembered; what comes then is looked for each time
+
+
+@dataclass
+class _Known:
+    """By device, inode and what is looked for: size and time of the file, and what was found.
+
+    A file that takes the inode of one that is gone takes its place here too, so a process keeps no more than there
+    are files.
+    """
+
+    found: dict[tuple[object, ...], tuple[tuple[int, int], bytes]] = field(default_factory=dict)
+    n_bytes: int = 0
+
+
+_KNOWN: ContextVar[_Known | None] = ContextVar("known", default=None)
 
 
 @contextmanager
@@ -22,7 +36,7 @@ def remembering() -> Iterator[None]:
 
     For one that goes over the same results again and again: every byte is held against its checksum once.
     """
-    token = _KNOWN.set({})
+    token = _KNOWN.set(_Known())
     try:
         yield
     finally:
@@ -30,7 +44,12 @@ def remembering() -> Iterator[None]:
 
 
 def remember(
-    path: Path, what: tuple[object, ...], look: Callable[[], Found], *, kept: Callable[[Found], bool] | None = None
+    path: Path,
+    what: tuple[object, ...],
+    look: Callable[[], Found],
+    *,
+    kept: Callable[[Found], bool] | None = None,
+    largest: int | None = None,
 ) -> Found:
     """Look into a file, or give a copy of what was found in it before.
 
@@ -44,6 +63,8 @@ def remember(
         Finds it.
     kept : callable, optional
         Whether what was found is remembered; by default it is.
+    largest : int, optional
+        Size of files (bytes) up to which they are remembered; by default all are.
 
     Examples
     --------
@@ -52,14 +73,22 @@ def remember(
     [1, 1]
     """
     known = _KNOWN.get()
-    if known is None or in_bucket(path) or not path.is_file():
+    if known is None or in_bucket(path):
         return look()
-    stat = path.stat()
+    try:
+        stat = path.stat()
+    except OSError:
+        return look()
+    if not S_ISREG(stat.st_mode) or (largest is not None and stat.st_size > largest):
+        return look()
     key, state = (stat.st_dev, stat.st_ino, *what), (stat.st_size, stat.st_mtime_ns)
-    if key in known and known[key][0] == state:
-        stored: Any = pickle.loads(known[key][1])
+    if key in known.found and known.found[key][0] == state:
+        stored: Any = pickle.loads(known.found[key][1])
         return stored  # type: ignore[no-any-return]
     found = look()
-    if kept is None or kept(found):
-        known[key] = state, pickle.dumps(found)
+    _, former = known.found.pop(key, (state, b""))
+    known.n_bytes -= len(former)
+    if known.n_bytes < MOST and (kept is None or kept(found)):
+        known.found[key] = state, pickle.dumps(found)
+        known.n_bytes += len(known.found[key][1])
     return found

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile, ZipInfo
@@ -20,6 +21,15 @@ from tiler.store.result_writer import DIGEST_BYTES, Writer, hash_content, raw_by
 
 MANIFEST = "manifest.jsonl"  # the only file beside the stages, see `tiler.workflow.audit`
 SUFFIX = ".zip"
+SMALL = 2**18  # bytes of a result that a process which remembers keeps in memory
+
+
+@lru_cache(4096)
+def _file(folder: Path, stage: str, name: str) -> Path:
+    for part in (stage, name):
+        if not part or part[0] == "." or any(sign in part for sign in "/\\\0"):
+            raise ValueError(f"{part!r} cannot name a result of the store")
+    return folder / stage / f"{name}{SUFFIX}"
 
 
 class Store:
@@ -36,10 +46,7 @@ class Store:
 
     def file(self, stage: str, name: str) -> Path:
         """Describe where a result lies; ValueError for a name that is no plain file name."""
-        for part in (stage, name):
-            if not part or part[0] == "." or any(sign in part for sign in "/\\\0"):
-                raise ValueError(f"{part!r} cannot name a result of the store")
-        return self.path / stage / f"{name}{SUFFIX}"
+        return _file(self.path, stage, name)
 
     def writer(self, stage: str, name: str) -> Writer:
         """Begin a result: a context manager with ``put``, ``append`` and ``commit``."""
@@ -74,9 +81,14 @@ class Store:
         ValueError
             If it has no array of such a name.
         """
-        with self.open(stage, name) as result:
-            wanted = result.names if names is None else sorted(set(names))
-            return {array: result.read(array) for array in wanted}, result.attributes
+
+        def look() -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+            with self.open(stage, name) as result:
+                wanted = result.names if names is None else sorted(set(names))
+                return {array: result.read(array) for array in wanted}, result.attributes
+
+        what = "read", None if names is None else frozenset(names)
+        return remember(self.file(stage, name), what, look, largest=SMALL)
 
     def read_rows(self, stage: str, name: str, array: str, start: int, stop: int) -> NDArray[Any]:
         """Read some rows of one array; errors as for `read`, ValueError if it does not have them."""

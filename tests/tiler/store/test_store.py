@@ -1,6 +1,7 @@
 """The store: whole or not at all, any plain array, every damage found, the same bytes for the same result."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -13,9 +14,10 @@ from zarr.storage import ZipStore
 
 from pipeline.data.errors import InputError, OutputError
 from tests.helpers.result_parts import parts, write_parts
+from tiler.store.remembered import remembering
 from tiler.store.result_file import CHUNK_BYTES
 from tiler.store.result_writer import SMALL_BYTES, SQUARE
-from tiler.store.store import Store
+from tiler.store.store import SMALL, Store
 
 RNG = np.random.default_rng(7)
 N_CHUNK = CHUNK_BYTES // 24  # rows of three float64 in a chunk
@@ -49,6 +51,28 @@ def test_every_type_comes_back_as_it_was(store: Store, dtype: str, n_rows: int) 
         assert arrays[name].dtype == values.dtype
         np.testing.assert_array_equal(arrays[name], values)
     assert store.shapes("s", "n") == {"flat": (n_rows,), "none": (n_rows, 0), "table": (n_rows, 3)}
+
+
+def test_a_process_that_remembers_reads_a_small_result_once_and_gives_copies(store: Store) -> None:
+    with remembering():
+        for answer in (1.0, 2.0):
+            store.write("s", "n", {"a": np.full(3, answer)}, answer=answer)
+            for _ in range(2):
+                arrays, attributes = store.read("s", "n")
+                assert (arrays["a"].tolist(), attributes) == ([answer] * 3, {"answer": answer})
+                arrays["a"][:], attributes["answer"] = -1, -1
+        store.write("s", "large", {"a": RNG.normal(size=SMALL)})
+        store.read("s", "large")
+        for path in (store.file("s", "n"), store.file("s", "large")):
+            stat = path.stat()
+            with path.open("r+b") as file:  # damage that changes neither inode nor size nor time
+                file.write(b"x" * stat.st_size)
+            os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        assert store.read("s", "n")[0]["a"].tolist() == [2.0] * 3
+        with pytest.raises(InputError):
+            store.read("s", "large")
+    with pytest.raises(InputError):
+        store.read("s", "n")
 
 
 def test_bits_come_back_as_they_were(store: Store) -> None:

@@ -731,7 +731,7 @@ def test_nothing_that_is_read_is_run_or_unpickled() -> None:
     # that it makes for itself alone (TemporaryDirectory); np.load unpickles nothing, if it is not told to.
     assert found == {
         "pickle.loads(pickle.dumps(error))",
-        "pickle.loads(known[key][1])",
+        "pickle.loads(known.found[key][1])",
         "loads(packed)",
         "pickle.load(file)",
         "pickle.loads(path.read_bytes())",
