@@ -28,6 +28,9 @@ ROW_CELL = 256.0  # m, side of the cells that buildings are sorted by
 STEP = 0.5  # m between points on roofs
 GROUND_STEP = 1.0  # m between points of terrain, and along outlines
 FOOT_ROOM = 0.25  # m from an outline to the points of the ground around it
+AROUND = 100.0  # m; buildings that close count as neighbours ...
+FEWEST = 3  # ... and so many of them tell where the ground is, ...
+OFF = 15.0  # m, ... from which a foot is told that lies higher or lower than theirs in the median
 UNIT = 0.001  # m of a coordinate
 
 Array = NDArray[np.float64]
@@ -101,6 +104,7 @@ def _make_block(batch: Sequence[ModelBuilding], frame: Frame, bounds: Box, wante
     if wanted.ground_points:
         parts.append(_sample_feet(rows))
         classes.append(np.full(len(parts[-1]), GROUND, np.uint8))
+        notes += _note_feet(rows)
     xyz, found = np.concatenate(parts), np.concatenate(classes)
     inside = _within(xyz, bounds)
     kept = [note for note in notes if np.isnan(note.x) or _within(np.array([[note.x, note.y]]), bounds)[0]]
@@ -131,6 +135,30 @@ def _sample_feet(rows: ModelRows) -> Array:
     around = shapely.buffer(rows.outlines[known], FOOT_ROOM, join_style="mitre")
     xy, row = along_outlines(around, GROUND_STEP)
     return np.column_stack((xy, rows.base[known][row]))
+
+
+def _note_feet(rows: ModelRows) -> list[Note]:
+    """Tell of the buildings that float above those around, or are sunk, where feet alone tell the ground."""
+    known = np.flatnonzero(np.isfinite(rows.base))
+    base, place = rows.base[known], shapely.point_on_surface(rows.outlines[known])
+    one, other = shapely.STRtree(place).query(place, predicate="dwithin", distance=AROUND)
+    one, other = one[one != other], other[one != other]
+    order = np.lexsort((base[other], one))
+    count = np.bincount(one, minlength=len(known))
+    told = np.flatnonzero(count >= FEWEST)
+    foot = base[other[order]][(np.cumsum(count) - count)[told] + (count[told] - 1) // 2]
+    far = base[told] - foot
+    x, y = shapely.get_x(place[told]), shapely.get_y(place[told])
+    return [
+        Note(
+            "model-off-neighbours",
+            str(rows.ids[known[told[k]]]),
+            float(x[k]),
+            float(y[k]),
+            f"its foot is {abs(far[k]):.1f} m {'above' if far[k] > 0 else 'below'} those of the buildings around",
+        )
+        for k in np.flatnonzero(np.abs(far) > OFF).tolist()
+    ]
 
 
 def _make_relief(faces: Faces, frame: Frame, bounds: Box, shift: float) -> Iterator[ModelBlock]:

@@ -169,6 +169,9 @@ WORDS: dict[str, Words] = {
     "model-off-ground": Words(
         OTHER, "{n} building[s] of the city model [stands|stand] more than 5 m above or below the ground"
     ),
+    "model-off-neighbours": Words(
+        OTHER, "{n} building[s] of the city model [stands|stand] more than 15 m above or below those around"
+    ),
     "model-shifted": Words(DEFAULTED, "city models were moved onto the terrain: --shift-z auto"),
     "model-shift": Words(OTHER, "the city model lies above or below the ground as a whole: see --shift-z"),
     "model-roof-gap": Words(

@@ -275,6 +275,21 @@ def test_points_of_overlapping_houses_lie_on_the_higher_one(tmp_path: Path) -> N
     assert roof[:, 2] == pytest.approx(np.where(x < 5, gable, np.where(x < 10, np.maximum(gable, 8.0), 8.0)))
 
 
+def test_a_building_that_floats_or_is_sunk_is_told_where_feet_alone_tell_the_ground(tmp_path: Path) -> None:
+    houses, vertices = {}, list[list[float]]()
+    for k, lift in enumerate((0.0, 5.0, 40.0, 0.0, -30.0)):
+        box, corners = box_solid(8.0, 2.2, len(vertices))
+        houses[f"h{k}"] = {"type": "Building", "geometry": [box]}
+        vertices += [[x + 20.0 * k, y, z + lift] for x, y, z in corners]
+    path = write_json(tmp_path / "a.json", city_json(houses, vertices))
+    told = [(note.kind, note.subject, note.detail) for note in block_of(path).notes]
+    assert told == [
+        ("model-off-neighbours", "h2", "its foot is 40.0 m above those of the buildings around"),
+        ("model-off-neighbours", "h4", "its foot is 30.0 m below those of the buildings around"),
+    ]
+    assert not block_of(path, Wanted("auto", "", roof_points=True, ground_points=False)).notes
+
+
 def test_points_are_made_where_they_are_wanted(tmp_path: Path) -> None:
     path = write_json(tmp_path / "a.json", house_json())
     assert len(block_of(path, Wanted("auto", "", roof_points=False, ground_points=False)).xyz) == 0
