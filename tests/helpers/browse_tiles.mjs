@@ -31,6 +31,7 @@ try {
   await page.waitForTimeout(500);
   await settle(page);
   seen.far = await text(page, "#detail");
+  seen.unknown = await page.evaluate(() => [...new Set([...window.citystitch.meshes].flatMap((mesh) => mesh.userData.own.rows).filter((row) => row.lod?.startsWith("1")).map((row) => row.roof_rmse))]);
   await page.keyboard.press("0");
   for (let k = 0; k < 2; k++) await page.keyboard.press("+");
   await page.waitForTimeout(500);

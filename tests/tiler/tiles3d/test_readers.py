@@ -133,6 +133,7 @@ def test_browsers_show_the_city(
     assert "error" not in seen, seen["error"]
     assert (seen["console"], seen["foreign"]) == ([], [])
     assert "level 0 to 0" in seen["far"]
+    assert seen["unknown"] == [-9999]  # of a block no error of its roof is known
     depth = max(level for level, _, _ in walk_tree(tiles))
     assert f"to {depth}, LoD" in seen["near"]
     assert "LoD 2.2" in seen["near"]

@@ -87,11 +87,16 @@ function showLegend() {
   for (const [key, colour] of state.classes) add(`#${colour.getHexString()}`, key);
 }
 
+// What a feature has no value of keeps the number that says so, for which the library would give 0.
+const keepNoData = ({ json }) => ({ name: "keep_no_data", beforeRoot() {
+  const classes = Object.values(json.extensions?.EXT_structural_metadata?.schema?.classes ?? {});
+  for (const one of classes.flatMap(({ properties }) => Object.values(properties))) if ("noData" in one) one.default ??= one.noData;
+} });
 const dracoLoader = new DRACOLoader().setDecoderPath("./"); // read when the first tile needs it
 function openTiles(place) {
   const own = new TilesRenderer("tiles/tileset.json");
   own.registerPlugin(new ImplicitTilingPlugin());
-  own.registerPlugin(new GLTFExtensionsPlugin({ metadata: true, dracoLoader, autoDispose: false }));
+  own.registerPlugin(new GLTFExtensionsPlugin({ metadata: true, dracoLoader, autoDispose: false, plugins: [keepNoData] }));
   if (place) for (const key of ["position", "quaternion", "scale"]) own.group[key].copy(place[key]);
   else own.registerPlugin(new ReorientationPlugin());
   own.errorTarget = 5; // pixels
