@@ -152,6 +152,9 @@ def test_openfoam_has_faces_of_three_and_of_four_corners(
     assert grid.n_cells == len(prisms.cells)
     record = json.loads((case / "export.json").read_text())["meshes"][0]
     assert record["faces"] == len(prisms.inner) + len(prisms.outer)
+    # With as many layers all of a hybrid mesh is prisms, also over seams: each side is one face.
+    hybrid = exported(layered_run, "openfoam", "--cells", "hybrid", "--prism-layers", "1000")
+    assert json.loads((hybrid / "export.json").read_text())["meshes"] == [record]
     assert record["patches"]["ground"] == (prisms.marker == Marker.GROUND).sum()
     quads = (prisms.outer[:, 3] != NO_CORNER) & (prisms.marker == Marker.WALL)
     assert record["patches"]["walls"] == quads.sum()
