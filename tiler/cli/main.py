@@ -214,6 +214,10 @@ def _check(options: argparse.Namespace) -> int:
 
         return 0 if audit_run(options.directory, print) else EXIT_FAILED
     refuse_bucket(options.directory, "check without --store")
+    if options.directory.suffix == ".gpkg" and not (options.cfd or options.direction or options.export):
+        from tiler.generalisation.prove import check_generalisation
+
+        return _print_proof(check_generalisation(options.directory))
     refuse_strangers(options.directory)
     if options.cfd:
         from tiler.check.cfd_guidelines import check_guidelines

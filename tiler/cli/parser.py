@@ -447,7 +447,9 @@ def _add_workers(parser: Any, what: str) -> None:
 
 
 def _add_check(check: argparse.ArgumentParser) -> None:
-    check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
+    check.add_argument(
+        "directory", type=place, metavar="DIR|FILE.gpkg", help="folder of a run, or an output of generalise"
+    )
     what = check.add_mutually_exclusive_group()
     what.add_argument("--store", action="store_true", help="instead verify the checksum of every file of the run")
     what.add_argument(

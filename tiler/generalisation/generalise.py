@@ -37,6 +37,7 @@ from tiler.vectors.gdal_layer import list_some
 from tiler.vectors.layers import split_layer
 
 MOST_TILES = 1_000_000
+ADJACENT = 1.0  # m; a wider gap of adjacent buildings is told with the numbers
 Result = TypeVar("Result")
 
 
@@ -135,7 +136,9 @@ def generalise(
         owners = _make_levels(_make_cells(tiles, work, each, told), work, each)
         levels = _write(files, owners, shards, crs, told)
     with replacing(files.numbers) as part:
-        numbers = {"levels": levels, "counts": told.known(), "notes": told.said}
+        numbers: dict[str, object] = {"levels": levels, "counts": told.known(), "notes": told.said}
+        if asked.adjacent > ADJACENT:
+            numbers["adjacent"] = asked.adjacent  # by which `check` may find outlines moved
         part.write_text(json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
     return [*table_lines(levels), *told.lines()]
 

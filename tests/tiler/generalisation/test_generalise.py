@@ -2,7 +2,10 @@
 
 import dataclasses
 import json
+import re
 import shutil
+import sqlite3
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ from tiler.config.zones import LOD
 from tiler.convert.inputs import open_source
 from tiler.generalisation import HEIGHTS
 from tiler.generalisation.options import Asked
+from tiler.generalisation.prove import check_generalisation
 
 PLACE = np.array([100_000.0, 450_000.0])  # in the Netherlands, EPSG:28992: a corner of tiles
 LEVELS = ("lod1", "lod0c", "lod0b", "lod0a")
@@ -288,6 +292,51 @@ def test_copies_layers_and_files_without_a_crs(
 def test_workers_write_the_same_bytes(files: list[str], tmp_path: Path) -> None:
     alone = make(tmp_path / "alone.gpkg", files)
     assert bytes_of(alone) == bytes_of(make(tmp_path / "two.gpkg", files, "--workers", "2"))
+
+
+def test_check_finds_a_change_of_any_field(files: list[str], tmp_path: Path) -> None:
+    out = make(tmp_path / "out.gpkg", files)
+    assert main(["check", str(out)]) == 0
+    unseen = []
+    with closing(sqlite3.connect(out, isolation_level=None)) as base:
+        for (trigger,) in base.execute("select name from sqlite_master where type = 'trigger'").fetchall():
+            base.execute(f'drop trigger "{trigger}"')
+        for layer in ("cells", *LEVELS):
+            columns = [row[1] for row in base.execute(f"pragma table_info({layer})")][1:]
+            row = base.execute(
+                f"select rowid, {', '.join(columns)} from {layer} order by members desc, id limit 1"
+            ).fetchone()
+            for name, value in zip(columns, row[1:], strict=True):
+                if value is None:  # of the ground, which is not known here
+                    continue
+                other = change(value)
+                base.execute(f"update {layer} set {name} = ? where rowid = ?", (other, row[0]))
+                unseen += [(layer, name)] if check_generalisation(out).ok else []
+                base.execute(f"update {layer} set {name} = ? where rowid = ?", (value, row[0]))
+    for path, texts in (
+        (out.with_suffix(".levels.json"), [r'"volume_error": ', r'"cells": ', r'"polygons": ']),
+        (out.with_suffix(".city.json"), [r'"height":', r'"level":"', r'"children":\["', r'"vertices":\[\n\[']),
+    ):
+        text = path.read_text()
+        for each in texts:
+            path.write_text(re.sub(f"({each})", r"\g<1>9", text, count=1))
+            unseen += [(path.name, each)] if check_generalisation(out).ok else []
+        path.write_text(text)
+    assert unseen == []
+    assert check_generalisation(out).ok
+    out.with_suffix(".levels.json").unlink()
+    with pytest.raises(CityError, match="no result of citystitch generalise"):
+        check_generalisation(out)
+
+
+def change(value: Any) -> Any:
+    """Give another text, number, or a geometry that is moved by a metre."""
+    if isinstance(value, bytes):
+        start = 8 + (0, 32, 48, 48, 64)[value[3] >> 1 & 7]
+        return value[:start] + shapely.to_wkb(
+            shapely.transform(shapely.from_wkb(value[start:]), lambda xy: xy + 15)
+        )
+    return value + "x" if isinstance(value, str) else value + 1
 
 
 def test_a_plan_counts_buildings_and_writes_nothing(
