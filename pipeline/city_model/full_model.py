@@ -3,6 +3,9 @@
 from collections.abc import Set
 
 import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pipeline.city_model.building_points import take_building_points
 from pipeline.city_model.city import City
@@ -10,9 +13,12 @@ from pipeline.city_model.houses import Houses, find_fallbacks, name_parts
 from pipeline.city_model.model_roofs import MODEL
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.roofs import choose_roofs, flat_roofs, highest_roofs
-from pipeline.roofs.house_roofs import RoofOptions
+from pipeline.roofs.house_levels import HouseParts
+from pipeline.roofs.house_roofs import FAMILY, PLANES, HouseRoofs, RoofOptions
 from pipeline.roofs.refit import refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, divide_roof_points
+
+CLOSE = 0.003  # m; corners that near would be one corner of a solid, whose coordinates are rounded to 1 mm
 
 
 def divide_city(city: City, houses: Houses, points: RoofPoints, *, reserved: Set[str]) -> tuple[City, RoofPoints]:
@@ -39,7 +45,7 @@ def divide_city(city: City, houses: Houses, points: RoofPoints, *, reserved: Set
     """
     if houses.full is None:
         return city, points
-    parts, roofs, model = houses.full.parts, houses.full.roofs, city.model
+    parts, roofs, model = join_close(houses.full, city.model.polygons), houses.full.roofs, city.model
     row = parts.house
     points = divide_roof_points(points, parts.polygons, row)
     fixed = ((houses.form >= 0) | (houses.full.method == MODEL))[row]
@@ -74,3 +80,44 @@ def divide_city(city: City, houses: Houses, points: RoofPoints, *, reserved: Set
         {},
     )
     return divided, points
+
+
+def join_close(fitted: HouseRoofs, outlines: NDArray[np.object_]) -> HouseParts:
+    """Join corners of parts that skeletons or a city model have closer than `CLOSE`; those of outlines stay.
+
+    Parameters
+    ----------
+    fitted : HouseRoofs
+        Roofs of h houses.
+    outlines : object, (h,)
+        Their outlines.
+
+    Returns
+    -------
+    HouseParts
+        The parts; one that would be no valid polygon stays as it is.
+    """
+    parts = fitted.parts
+    rows = np.flatnonzero(~np.isin(fitted.method, (PLANES, FAMILY))[parts.house])
+    xy, of = shapely.get_coordinates(parts.polygons[rows], return_index=True)
+    house = parts.house[rows][of]
+    near = cKDTree(xy).query_pairs(CLOSE, output_type="ndarray") if len(xy) else np.empty((0, 2), np.int64)
+    near = near[(house[near[:, 0]] == house[near[:, 1]]) & (xy[near[:, 0]] != xy[near[:, 1]]).any(axis=1)]
+    if not len(near):
+        return parts
+    corners = {
+        k: set(map(tuple, shapely.get_coordinates(outlines[k]).tolist())) for k in house[near[:, 0]].tolist()
+    }
+    rank = {k: (tuple(xy[k].tolist()) not in corners[house[k]], *xy[k].tolist()) for k in np.unique(near).tolist()}
+    target = dict(rank)
+    for pair in near.tolist():
+        first, last = sorted(pair, key=rank.__getitem__)
+        if rank[last][0]:
+            target[last] = min(target[last], rank[first])
+    for k, (_, *place) in target.items():
+        xy[k] = place
+    joined = shapely.remove_repeated_points(shapely.set_coordinates(parts.polygons[rows], xy))
+    sound = shapely.is_valid(joined) & ~shapely.is_empty(joined)
+    polygons = parts.polygons.copy()
+    polygons[rows] = np.where(sound, joined, polygons[rows])
+    return HouseParts(polygons, parts.house)

@@ -272,6 +272,8 @@ def _describe_roof_fit(found: dict[str, Any]) -> Iterator[str]:
         ]
         head = ["roof", "building parts", "points", "RMSE (m)", "median of medians (m)", CLOSE]
         rows.append(["all", *(number(value) for value in _sum_fits(found["roof_fit"]))])
+        if "full_roof_fit" in found:
+            rows.append(["all of the full city model", *map(number, _sum_fits(found["full_roof_fit"]))])
         yield heading("Roofs by method")
         yield table("Roofs over their points, façade points and what stands on roofs too", head, rows)
     if found.get("worst_roofs"):

@@ -153,9 +153,13 @@ def _describe_cover(records: Records, config: Config) -> dict[str, Any]:
 
 
 def _roof_fit(records: Records) -> dict[str, Any]:
-    """Describe how roofs of planes fit their points."""
-    facts = records["citymodel", REGION_ITEM].facts if ("citymodel", REGION_ITEM) in records else {}
-    return {name: facts[name] for name in ("roof_fit", "worst_roofs") if name in facts}
+    """Describe how roofs of planes fit their points, and those of the full city model."""
+    simple, full = (
+        records[stage, REGION_ITEM].facts if (stage, REGION_ITEM) in records else {}
+        for stage in ("citymodel", "citymodel-full")
+    )
+    found = {name: simple[name] for name in ("roof_fit", "worst_roofs") if name in simple}
+    return found | ({"full_roof_fit": full["roof_fit"]} if "roof_fit" in full else {})
 
 
 def _describe_pad(engine: Engine) -> dict[str, Any]:

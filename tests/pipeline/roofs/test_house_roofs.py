@@ -140,15 +140,26 @@ def test_a_part_may_lie_around_another_one() -> None:
     assert sorted(shapely.get_num_interior_rings(found.parts.polygons).tolist()) == [0, 1]
 
 
-def test_the_order_of_points_does_not_matter() -> None:
+def test_the_order_of_points_does_not_matter_and_a_second_division_is_closer() -> None:
     polygons, points = town_of_slopes(8, density=5)
-    found, _ = fit_roofs(polygons, points, OPTIONS)
+    found, finer = fit_roofs(polygons, points, OPTIONS, (0.2, 1.0))
     rng = np.random.default_rng(3)
     owner = np.repeat(np.arange(8), np.diff(points.start))
     order = np.lexsort((rng.random(len(owner)), owner))
-    again, _ = fit_roofs(polygons, make_roof_points(points.start, points.xyz[order]), OPTIONS)
+    mixed = make_roof_points(points.start, points.xyz[order])
+    again, finer_again = fit_roofs(polygons, mixed, OPTIONS, (0.2, 1.0))
+    assert finer is not None
+    assert finer_again is not None
     assert_same(again, found)
-    check_cover(found, polygons)
+    assert_same(finer_again, finer)
+    assert_same(fit_roofs(polygons, points, OPTIONS)[0], found)
+    for one in (found, finer):
+        check_cover(one, polygons)
+    worst = [
+        np.nanpercentile(np.abs(heights_at(one, points.xyz[:, :2]) - points.xyz[:, 2]), 99)
+        for one in (found, finer)
+    ]
+    assert worst[1] < worst[0]
 
 
 def assert_same(one: HouseRoofs, other: HouseRoofs) -> None:

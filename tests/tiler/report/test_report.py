@@ -360,10 +360,14 @@ def test_roofs_of_planes_are_told_by_method_and_the_worst_are_listed(copy: Path)
         **{"id": "<h1>", "method": "planes", "parts": 3, "points": 77, "rmse": 9.875, "within": 0.25},
         **{"worst_part": "h1-part2", "x": 12.5, "y": 7.0, "why": "few & far"},
     }
-    change_record(copy, fidelity=record["fidelity"] | {"roof_fit": fit, "worst_roofs": [worst]})
+    full = {"planes": {"buildings": 77, "points": 99, "rmse": 2.5, "median": 0.125, "within": 0.875}}
+    told = {"roof_fit": fit, "worst_roofs": [worst], "full_roof_fit": full}
+    change_record(copy, fidelity=record["fidelity"] | told)
     words = read(write_report(copy)).words
-    for told in ("1,234", "56,789", "1.250", "0.125", "0.750", "4,321", "<h1>", "9.875"):
-        assert told in words
+    for word in ("1,234", "56,789", "1.250", "0.125", "0.750", "4,321", "<h1>", "9.875"):
+        assert word in words
     total = words[words.index("all") + 1 :]
     assert total[:5] == ["5,560", "227,156", f"{(1.75 / 4) ** 0.5:.3f}", "-", f"{2.25 / 4:.3f}"]
+    total = words[words.index("all of the full city model") + 1 :]
+    assert total[:5] == ["77", "99", "2.500", "-", "0.875"]
     assert "h1-part2 at 12.5, 7.0: few & far" in words
