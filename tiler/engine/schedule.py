@@ -203,7 +203,9 @@ class Schedule:
                 return ""
             return None if (source, n) in before else engine.records.digest(source, n)
 
-        digests = {source: {n: digest(source, n) for n in names} for source, names in refs.items()}
+        silent = {read.stage for read in planned.stage.reads if read.silent}
+        heard = ((source, names) for source, names in refs.items() if names or source not in silent)
+        digests = {source: {n: digest(source, n) for n in names} for source, names in heard}
         held = {source: [n for n, found in names.items() if found] for source, names in digests.items()}
         gaps = engine.find_gaps(scope, box, held)
         named_by = {source: by for source, by in planned.named_by.items() if (by, name) in before}

@@ -66,6 +66,8 @@ class Read:
     within : bool
         Of each result the function looks only at what lies at the reader's box grown by the halo: a change
         elsewhere in it, as `Engine.changes` knows of one, leaves the reader's result as it is.
+    silent : bool
+        With `own` and `optional`: where there is no such item, the key is as if the stage was not read.
     """
 
     stage: str
@@ -78,6 +80,7 @@ class Read:
     beside: bool = False
     others_by_name: bool = False
     within: bool = False
+    silent: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.halo) and self.halo >= 0):

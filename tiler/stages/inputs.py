@@ -89,7 +89,7 @@ def input_stages(config: Config, *, edited: bool = False) -> list[Stage]:
         *([Read(MODEL_OUTLINES)] if both else []),
         *(Read(stage.name) for stage in blocks),
     )
-    edits = (Read(EDITED, own=True, optional=True),) if edited else ()
+    edits = (Read(EDITED, own=True, optional=True, silent=True),) if edited else ()
     return [
         *blocks,
         Stage(

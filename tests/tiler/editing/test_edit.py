@@ -86,6 +86,7 @@ def test_edits_end_in_the_bytes_of_one_run_and_a_day_has_those_before_it(edited:
     assert not [*Audit(city)]
     record = json.loads((city / "run.json").read_text())
     assert "damaged-artefact" not in record["notes"]
+    assert json.loads((edited / "run.json").read_text())["ran"]["outlines"] == 1  # though it is the first edit
     ran = record["ran"]
     assert ran.keys().isdisjoint({"points", "footprints", "terrain"})
     assert ran["columns"] < 4  # others have the same buildings around them
