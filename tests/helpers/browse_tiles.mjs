@@ -52,6 +52,10 @@ try {
     seen.modes[mode] = await page.evaluate(() => new Set([...window.citystitch.meshes].flatMap((mesh) => Array.from(mesh.geometry.getAttribute("color").array, (one, k) => k % 3 ? [] : one).flat())).size);
   }
   await page.selectOption("#mode", "height");
+  seen.mixed = await page.evaluate(() => [...window.citystitch.meshes].flatMap((mesh) => {
+    const { index } = mesh.geometry, colour = mesh.geometry.getAttribute("color"), at = (k) => [colour.getX(k), colour.getY(k), colour.getZ(k)].join();
+    return Array.from({ length: index.count / 3 }, (_, k) => new Set([0, 1, 2].map((j) => at(index.getX(3 * k + j)))).size > 1 ? [k] : []).flat();
+  }).length);
   await page.screenshot({ path: `${folder}/view.png` });
   await page.keyboard.press("Escape");
   await page.focus("#view");

@@ -143,6 +143,7 @@ def test_browsers_show_the_city(
         known = model[row["id"]]["attributes"]
         assert float(row["height"]) == pytest.approx(known["height"], abs=0.006)
         assert row["roof method"] == known["roof_method"]
+    assert seen["mixed"] == 0  # triangles of more than one colour
     assert seen["modes"]["height"] > seen["modes"]["surface"] > 1
     assert seen["length"].count(" m") == 3
     assert (seen["ended"], seen["overflow"]) == ("", 0)

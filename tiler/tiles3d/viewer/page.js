@@ -61,9 +61,12 @@ function colourOf(mesh, row) {
 
 function paint(mesh) {
   const { rows } = mesh.userData.own;
-  const ids = mesh.geometry.getAttribute("_feature_id_0").array, colours = mesh.geometry.getAttribute("color");
+  const ids = mesh.geometry.getAttribute("_feature_id_0"), colours = mesh.geometry.getAttribute("color");
   const own = rows.map((row) => colourOf(mesh, row));
-  for (let k = 0; k < ids.length; k++) colours.setXYZ(k, own[ids[k]].r, own[ids[k]].g, own[ids[k]].b);
+  for (let k = 0; k < ids.count; k++) {
+    const { r, g, b } = own[ids.getX(k)]; // Draco's ids have gaps between them
+    colours.setXYZ(k, r, g, b);
+  }
   colours.needsUpdate = true;
 }
 
