@@ -173,7 +173,7 @@ def _top_row(survey: CfdSurvey) -> CfdRow:
 
 def _cell_rows(survey: CfdSurvey) -> list[CfdRow]:
     growth = percentile(survey.growth, MOST)
-    grown = growth <= EXPANSION
+    grown = round(growth, 2) <= EXPANSION  # as it is shown
     sides = survey.cells_a_side[~np.isnan(survey.cells_a_side)]
     cells = float(np.median(sides)) if len(sides) else 0.0
     enough = cells >= CELLS_A_SIDE
@@ -200,6 +200,6 @@ def _cell_rows(survey: CfdSurvey) -> list[CfdRow]:
             f"first {first:.2f} m high, third begins at {second:.2f} m for {MOST:g} %",
             (f"third <= {PEDESTRIAN_HEIGHT} m", f"third <= {PEDESTRIAN_HEIGHT} m"),
             (low, low),
-            f"--first-layer {PEDESTRIAN_HEIGHT / 2.2:.1f}",
+            f"--first-layer {PEDESTRIAN_HEIGHT / 2.4:.1f}",  # two of them, the second up to 1.4 times as high
         ),
     ]
