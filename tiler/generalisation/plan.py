@@ -13,7 +13,7 @@ from tiler.generalisation.summary import Told
 # Measured (docs/generalisation.md): processor time of all steps, and memory of a process with tiles of 1 km.
 SECONDS = (0.35, 0.00075)  # a km² with buildings, and a building
 BYTES = (260e6, 5e3)  # of a process, and of a building in a tile and its neighbours
-KEPT = (0.3e3, 0.5e3)  # bytes of a building in numbers of the region: where blocks have many, and one each
+KEPT = 2.6e3  # bytes of a tile in the first process
 
 
 def plan_generalisation(inputs: Inputs, asked: Asked) -> list[str]:
@@ -31,11 +31,10 @@ def plan_generalisation(inputs: Inputs, asked: Asked) -> list[str]:
     area = len(count) * (asked.tile_size / 1000) ** 2
     seconds = SECONDS[0] * area + SECONDS[1] * n
     process = BYTES[0] + BYTES[1] * most
-    low, high = (each * n / 1e6 for each in KEPT)
     return [
         *told.lines(),
         f"{n:,} buildings in {len(count):,} tiles of {asked.tile_size:g} m, {most:,} at most in one and around it",
         f"tasks: {6 * len(count):,}, some {seconds:,.0f} s of processor time",
-        f"memory: some {process / 1e6:,.0f} MB a process, and {low:,.0f} to {high:,.0f} MB in the first for all "
-        "cells; open land without barriers is one cell, which is not foreseen",
+        f"memory: some {process / 1e6:,.0f} MB a process, and {KEPT * len(count) / 1e6:,.1f} MB more in the first "
+        "for all tiles; open land without barriers is one cell, which is not foreseen",
     ]

@@ -346,7 +346,7 @@ def test_a_plan_counts_buildings_and_writes_nothing(
     assert main(["generalise", *files, "--plan", "--tile-size", "100"]) == 0
     told = capsys.readouterr().out
     assert "12 buildings in " in told
-    assert "memory: some 260 MB a process, and 0 to 0 MB in the first" in told
+    assert "memory: some 260 MB a process, and 0.0 MB more in the first" in told
     assert sorted(tmp_path.iterdir()) == before
     assert main(["generalise", *files]) == 2
     assert "give -o FILE.gpkg, or --plan" in capsys.readouterr().err
