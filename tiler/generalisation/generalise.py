@@ -99,7 +99,7 @@ def generalise(
     -----
     The inputs are read once, and dealt out to tiles in a temporary folder; then each step works on a tile, or on
     the cells that a tile owns: those whose first piece lies in it. Memory holds a tile with its neighbours, the
-    largest cell, the numbers of some columns of tiles, and some hundred bytes for each tile.
+    largest cell, the numbers of some columns of tiles, and some kB for each tile.
     """
     files = Outputs(output)
     if output.suffix != ".gpkg":
