@@ -110,7 +110,10 @@ def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path:
     record = run_of(town, out, **ZONES)
     prove(out)
     assert {f"parts at level {level}" for level in LEVELS[:3]} <= record["counts"].keys()
-    shape_city(town, tmp_path / "full")
+    shape_city(town | {"full_parts": False}, tmp_path / "full")
+    divided, whole = ((folder / FULL_CITY_MODEL).read_text() for folder in (out, tmp_path / "full"))
+    assert '"parents"' in divided
+    assert '"parents"' not in whole
     mine, full = models(out), models(tmp_path / "full")
     text = (out / CITY_MODEL).read_text()
     objects = json.loads(text)["CityObjects"]

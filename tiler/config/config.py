@@ -245,6 +245,10 @@ class Config:
         4.0, "simplify", "roof area half a metre off its points that a wall between planes must save: less gives "
         "more planes and cells, with roofs = planes", unit="m2", least=0.5,
     )  # fmt: skip
+    full_parts: bool = _parameter(
+        True, "simplify", "divide the houses of citymodel-full.city.json by their roofs, closer to points than the "
+        "mesh; without, each has one height there; with sloped roofs",
+    )  # fmt: skip
     split_levels: bool = _parameter(
         True, "simplify", "divide houses where their roof points show a step, with roofs = flat"
     )
@@ -587,6 +591,7 @@ def idle_parameters(config: Config) -> list[str]:
     ]
     idle += [
         (("roof_price",), config.roofs == "planes" and config.has_sloped_roofs, "roofs = planes"),
+        (("full_parts",), config.has_sloped_roofs, "roofs = planes, skeleton"),
         (OF_FLAT_ROOFS, not config.has_sloped_roofs, "roofs = flat"),
         (("finer_clearance",), config.keeps_model_roofs, "buildings whose roofs are meshed as they are"),
         (("grading",), config.graded_size, "open_size above 0"),

@@ -110,7 +110,7 @@ def house_stage(config: Config) -> Stage:
     models = ("buildings_given", "ground_of_models", "prefer") if config.buildings else ()
     finer = FINER_PARAMETERS if config.keeps_model_roofs else ()
     blocks = BLOCK_PARAMETERS if config.has_blocks else ()
-    parameters = (*CITY_PARAMETERS, *TERRAIN, *models, *finer, *blocks)
+    parameters = (*CITY_PARAMETERS, "full_parts", *TERRAIN, *models, *finer, *blocks)
     return Stage("houses", Scope.TILE, make_houses, reads, parameters, version=7)
 
 
@@ -235,7 +235,7 @@ def make_houses(task: Task) -> Facts:
             unmarked=others | told,
             surfaces=surfaces,
             prefer_points=task.parameters.get("prefer", "model") == "points",
-            full=True,
+            full=task.parameters.full_parts,
         )
     del cloud  # large, and no longer needed
     with task.step("1.7 full city model"):
