@@ -30,14 +30,13 @@ def rank_levels(levels: Sequence[float], asked: str) -> list[float]:
     return [*[level for level in known if level <= most][::-1], *[level for level in known if level > most], *none]
 
 
-def list_attempts(building: ModelBuilding, asked: str) -> list[tuple[float, Faces]]:
-    """List what may be taken for a building's faces, the best first: the best level among the faces, and these.
+def list_attempts(building: ModelBuilding, asked: str) -> list[tuple[float, list[Shape]]]:
+    """List what may be taken for a building, the best first: the best level among the shapes, and these.
 
     Each part has its best level; from one attempt to the next the best of all is left out. A building's own faces
     count where its parts have none that is better. None where the building has no level from 1 on.
     """
-    attempts = _choose_shapes(building, asked)
-    return [(level, join_faces(shape.faces for shape in chosen)) for level, chosen in attempts]
+    return list(_choose_shapes(building, asked))
 
 
 def best_shapes(building: ModelBuilding, asked: str) -> tuple[Shape, ...]:

@@ -14,7 +14,7 @@ from pipeline.data.citymodel import make_ids
 from pipeline.data.notes import Note
 from pipeline.data.roofs import Roofs, join_roofs, take_roofs
 from tiler.cityinput.face_planes import FacePlanes, find_planes
-from tiler.cityinput.faces import GROUND, OUTLINE, ROOF, WALL, Faces, ModelBuilding, join_faces
+from tiler.cityinput.faces import GROUND, OUTLINE, ROOF, WALL, Faces, ModelBuilding, Shape, join_faces
 from tiler.cityinput.levels import find_outline, list_attempts
 from tiler.georeference.frame import Frame, to_region
 
@@ -178,10 +178,10 @@ def _to_region(faces: Faces, placing: Placing) -> Faces:
     return Faces(xyz, faces.ring_start, faces.face_start, faces.kind)
 
 
-def _find_roofs(tries: Sequence[tuple[int, float, Faces]], placing: Placing) -> dict[int, _Found]:
+def _find_roofs(tries: Sequence[tuple[int, float, list[Shape]]], placing: Placing) -> dict[int, _Found]:
     """Find outlines and roofs of buildings, all faces at a time; none for those without roof surfaces."""
-    faces = _to_region(join_faces(one for _, _, one in tries), placing)
-    owner = np.repeat(np.arange(len(tries)), [len(one) for _, _, one in tries])
+    faces = _to_region(join_faces(shape.faces for _, _, shapes in tries for shape in shapes), placing)
+    owner = np.repeat(np.arange(len(tries)), [sum(len(s.faces) for s in shapes) for _, _, shapes in tries])
     planes = find_planes(faces)
     up = np.abs(planes.normal[:, 2])
     whole = np.linalg.norm(planes.normal, axis=1)
@@ -321,7 +321,7 @@ def _count(
 
 def _note(
     building: ModelBuilding,
-    attempts: Sequence[tuple[float, Faces]],
+    attempts: Sequence[tuple[float, list[Shape]]],
     found: _Found | None,
     place: Sequence[float] | None,
 ) -> list[Note]:

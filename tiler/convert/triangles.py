@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.facades.pictures import Picture
 from tiler.cityinput.face_planes import cut_face
-from tiler.cityinput.faces import PICTURED, Faces
-from tiler.cityinput.levels import list_attempts
+from tiler.cityinput.faces import PICTURED, Faces, join_faces
+from tiler.cityinput.levels import best_shapes
 from tiler.convert.features import plain_value, rings_of
 from tiler.convert.inputs import ModelSource
 
@@ -31,13 +31,13 @@ class SolidBuilding:
 
 
 def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
-    """Give each building that has surfaces, at the level that `levels.list_attempts` puts first."""
+    """Give each building that has surfaces, of the shapes that `levels.best_shapes` gives."""
     for building in source.buildings():
-        attempts = list_attempts(building, lod)
-        if not attempts:
+        shapes = best_shapes(building, lod)
+        if not shapes:
             source.told["buildings without surfaces above level 0"] += bool(building.shapes)
             continue
-        faces = attempts[0][1]
+        faces = join_faces(shape.faces for shape in shapes)
         xyz, number = np.unique(np.round(faces.xyz / source.step), axis=0, return_inverse=True)
         xyz = xyz * source.step
         triangles, face, n_fans = triangulate(faces, xyz, number.ravel().tolist())
