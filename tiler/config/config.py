@@ -246,8 +246,8 @@ class Config:
         "more planes and cells, with roofs = planes", unit="m2", least=0.5,
     )  # fmt: skip
     full_parts: bool = _parameter(
-        True, "simplify", "divide the houses of citymodel-full.city.json by their roofs, closer to points than the "
-        "mesh; without, each has one height there; with sloped roofs",
+        True, "simplify", "divide the houses of citymodel-full.city.json by their roofs, closer to points than "
+        "the mesh; without, each has one height there; with sloped roofs",
     )  # fmt: skip
     split_levels: bool = _parameter(
         True, "simplify", "divide houses where their roof points show a step, with roofs = flat"

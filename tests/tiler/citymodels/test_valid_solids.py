@@ -94,7 +94,7 @@ def assert_valid(path: Path, lods: list[str] = LODS) -> int:
 
 def test_solids_of_a_run_are_valid(sloped_run: Path) -> None:
     assert assert_valid(sloped_run / CITY_MODEL) > 60
-    assert assert_valid(sloped_run / FULL_CITY_MODEL) > 60
+    assert assert_valid(sloped_run / FULL_CITY_MODEL, ["2.2"]) > 60
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -123,7 +123,7 @@ def test_solids_of_amsterdam_are_valid(shared_data: Path, tmp_path: Path, roofs:
     }
     shape_city(values, tmp_path / "out")
     assert assert_valid(tmp_path / "out" / CITY_MODEL) > 1000
-    assert assert_valid(tmp_path / "out" / FULL_CITY_MODEL) > 1000
+    assert assert_valid(tmp_path / "out" / FULL_CITY_MODEL, ["1.2", "2.2"]) > 1000
 
 
 def schema(name: str) -> Any:
