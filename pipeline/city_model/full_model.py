@@ -3,9 +3,9 @@
 from collections.abc import Set
 
 import numpy as np
+import scipy  # what is asked of it is imported then
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pipeline.city_model.building_points import take_building_points
 from pipeline.city_model.city import City
@@ -98,10 +98,13 @@ def join_close(fitted: HouseRoofs, outlines: NDArray[np.object_]) -> HouseParts:
         The parts; one that would be no valid polygon stays as it is.
     """
     parts = fitted.parts
-    rows = np.flatnonzero(~np.isin(fitted.method, (PLANES, FAMILY))[parts.house])
+    divided = np.bincount(parts.house, minlength=len(fitted.method)) > 1
+    rows = np.flatnonzero((divided & ~np.isin(fitted.method, (PLANES, FAMILY)))[parts.house])
+    if not len(rows):
+        return parts
     xy, of = shapely.get_coordinates(parts.polygons[rows], return_index=True)
     house = parts.house[rows][of]
-    near = cKDTree(xy).query_pairs(CLOSE, output_type="ndarray") if len(xy) else np.empty((0, 2), np.int64)
+    near = scipy.spatial.cKDTree(xy).query_pairs(CLOSE, output_type="ndarray")
     near = near[(house[near[:, 0]] == house[near[:, 1]]) & (xy[near[:, 0]] != xy[near[:, 1]]).any(axis=1)]
     if not len(near):
         return parts

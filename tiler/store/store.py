@@ -3,7 +3,6 @@
 import json
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile, ZipInfo
@@ -24,14 +23,6 @@ SUFFIX = ".zip"
 SMALL = 2**18  # bytes of a result that a process which remembers keeps in memory
 
 
-@lru_cache(4096)
-def _file(folder: Path, stage: str, name: str) -> Path:
-    for part in (stage, name):
-        if not part or part[0] == "." or any(sign in part for sign in "/\\\0"):
-            raise ValueError(f"{part!r} cannot name a result of the store")
-    return folder / stage / f"{name}{SUFFIX}"
-
-
 class Store:
     """Results by stage and name below one folder.
 
@@ -46,7 +37,10 @@ class Store:
 
     def file(self, stage: str, name: str) -> Path:
         """Describe where a result lies; ValueError for a name that is no plain file name."""
-        return _file(self.path, stage, name)
+        for part in (stage, name):
+            if not part or part[0] == "." or any(sign in part for sign in "/\\\0"):
+                raise ValueError(f"{part!r} cannot name a result of the store")
+        return self.path / stage / f"{name}{SUFFIX}"
 
     def writer(self, stage: str, name: str) -> Writer:
         """Begin a result: a context manager with ``put``, ``append`` and ``commit``."""

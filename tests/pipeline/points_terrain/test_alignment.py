@@ -96,14 +96,12 @@ def corners_of(out: Path) -> dict[str, Any]:
     city = json.loads((out / "citymodel-full.city.json").read_text())
     vertices = np.array(city["vertices"]) * city["transform"]["scale"] + city["transform"]["translate"]
     low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
-    found = {}
+    used: dict[str, list[int]] = {}
     for name, item in city["CityObjects"].items():
-        faces = item["geometry"][-1]["boundaries"] if item["geometry"] else []
-        rows = np.unique(np.fromiter(flatten(faces), np.int64))
-        xy = vertices[rows, :2] if len(rows) else low[None]
-        if (xy > low + 5).all() and (xy < high - 5).all():
-            found[name] = xy.min(axis=0)
-    return found
+        mine = used.setdefault(item.get("parents", [name])[0], [])
+        mine += [row for shape in item.get("geometry", []) for row in flatten(shape["boundaries"])]
+    places = {name: vertices[rows, :2] for name, rows in used.items() if rows}
+    return {name: xy.min(axis=0) for name, xy in places.items() if (xy > low + 5).all() and (xy < high - 5).all()}
 
 
 def flatten(item: Any) -> Any:
