@@ -3,7 +3,6 @@
 from collections.abc import Set
 
 import numpy as np
-import scipy  # what is asked of it is imported then
 import shapely
 from numpy.typing import NDArray
 
@@ -104,8 +103,10 @@ def join_close(fitted: HouseRoofs, outlines: NDArray[np.object_]) -> HouseParts:
         return parts
     xy, of = shapely.get_coordinates(parts.polygons[rows], return_index=True)
     house = parts.house[rows][of]
-    near = scipy.spatial.cKDTree(xy).query_pairs(CLOSE, output_type="ndarray")
-    near = near[(house[near[:, 0]] == house[near[:, 1]]) & (xy[near[:, 0]] != xy[near[:, 1]]).any(axis=1)]
+    places = shapely.points(xy)
+    near = shapely.STRtree(places).query(places, predicate="dwithin", distance=CLOSE).T
+    near = near[(near[:, 0] < near[:, 1]) & (house[near[:, 0]] == house[near[:, 1]])]
+    near = near[(xy[near[:, 0]] != xy[near[:, 1]]).any(axis=1)]
     if not len(near):
         return parts
     corners = {
