@@ -146,23 +146,27 @@ def read_document(path: Path) -> tuple[dict[str, Any], Callable[[int], NDArray[A
 
 
 def read_glb(path: Path) -> Patches:
-    """Triangles of each node, or of each material of the node that is no building."""
+    """Triangles of each building, and of each material of nodes that are none."""
     document, take = read_document(path)
     found: dict[str, list[Corners]] = {}
-    points = take(0).reshape(-1, 3).astype(np.float64)
     assert document["scenes"] == [{"nodes": list(range(len(document["nodes"])))}]
+    assert len({node["name"] for node in document["nodes"]}) == len(document["nodes"])
     for node in document["nodes"]:
         mesh = document["meshes"][node["mesh"]]
         assert mesh["name"] == node["name"]
         for primitive in mesh["primitives"]:
-            material, name = document["materials"][primitive["material"]]["name"], node["name"]
-            assert primitive["attributes"]["POSITION"] == 0
-            if name == "boundary":
-                name = material
-            else:
-                assert name == building_name(node["extras"]["building"])
+            name = material = document["materials"][primitive["material"]]["name"]
+            points = take(primitive["attributes"]["POSITION"]).reshape(-1, 3).astype(np.float64)
+            rows = take(primitive["indices"]).reshape(-1, 3)
+            if node["name"] != "boundary":  # a node a patch, with vertices of its own
+                assert len(mesh["primitives"]) == 1
+                assert np.array_equal(np.unique(rows), np.arange(len(points)))
+                assert not node["name"][-1].isdecimal()
+            if "building" in node.get("extras", {}):
+                name = building_name(node["extras"]["building"])
                 assert material == {Marker.WALL: "walls", Marker.ROOF: "roofs"}[primitive["extras"]["marker"]]
-            found.setdefault(name, []).append(points[take(primitive["indices"]).reshape(-1, 3)])
+                assert node["name"] == f"{name}_{material}"
+            found.setdefault(name, []).append(points[rows])
     return {name: np.concatenate(rows) for name, rows in found.items()}
 
 

@@ -1,11 +1,15 @@
-"""glTF 2.0 in one binary file: the boundary as one mesh, with a primitive and a material a patch.
+"""glTF 2.0 in one binary file: the boundary as one mesh with a primitive a patch, or a node a patch.
 
 glTF has float32 and y up: coordinates are shifted to a local origin and turned, and the file's `extras` tell how.
 """
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from shutil import copyfileobj
+from tempfile import TemporaryDirectory
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +19,7 @@ from pipeline.data.mesh import Marker
 from tiler.export.export import LARGEST_PART, Format
 from tiler.export.foam_patches import FIRST_BUILDING, building_name, facets_by_key, is_house, patch_of_key
 from tiler.export.surface import (
+    KeysOf,
     Surface,
     SurfacePiece,
     SurfaceSurvey,
@@ -41,7 +46,7 @@ def export_glb(output: Path, source: RunSource, *, buildings: str | None = None)
     source : Path or RunFiles
         Folder of the run.
     buildings : {"patches"}, optional
-        Give each building a node of its own.
+        Give walls and roofs of each building, and each other patch, a node with vertices of its own.
 
     Raises
     ------
@@ -78,39 +83,84 @@ def write_glb(path: Path, surface: Surface, *, crs: str, buildings: str | None =
 
     Notes
     -----
-    The origin is the middle of the box in whole metres, at its lowest height. All patches share the vertices.
-    Memory holds one piece, and a quarter of a byte a point of the mesh. Each piece is read twice.
+    The origin is the middle of the box in whole metres, at its lowest height. Memory holds one piece, and a
+    quarter of a byte a point of the mesh; with ``buildings`` the largest patch, too. Each piece is read twice.
     """
     keys_of = by_marker if buildings is None else _by_building_and_marker
     survey = survey_surface(surface, keys_of)
     if not survey.n_facets:
         raise InputError("boundary: has no facets, and GLB no empty meshes; mesh the region again")
     origin = np.floor([*(survey.low + survey.high)[:2] / 2, survey.low[2]])
-    text = json.dumps(_document(survey, origin, crs, surface.ground), separators=(",", ":")).encode()
-    data = _data_bytes(survey)
-    head = begin_glb(text, data)
-    total = len(head) + data
-    if total > MOST_BYTES:
-        raise InputError(
-            f"boundary: {total} bytes as GLB; bound: {MOST_BYTES}; use --format ply, or mesh a part of the region"
-        )
-    with path.open("wb") as file:
-        file.write(head)
-        start = file.tell()
-        places, place = {}, start + survey.n_vertices * VERTEX_BYTES
+    if buildings is None:
+        # Rounding keeps order, so the corners of the box are turned into the exact least and greatest coordinates.
+        box = _local(np.stack((survey.low, survey.high)), origin)
+        ends = box.min(axis=0), box.max(axis=0)
+        patches = {key: _Patch(n, 0, survey.n_vertices, *ends) for key, n in survey.facets.items()}
+        head = _head(patches, survey.n_vertices, origin, crs, surface.ground, {-1: list(patches)})
+        with path.open("wb") as file:
+            file.write(head)
+            _write_shared(file, surface, survey, keys_of, origin)
+        return
+    with TemporaryDirectory(dir=path.parent) as folder:
+        names = shared, vertices, facets = [Path(folder) / name for name in ("shared", "vertices", "facets")]
+        with shared.open("wb") as file:
+            _write_shared(file, surface, survey, keys_of, origin)
+        patches = _part_patches(shared, vertices, facets, survey)
+        n_vertices, nodes = vertices.stat().st_size // VERTEX_BYTES, {key: [key] for key in patches}
+        head = _head(patches, n_vertices, origin, crs, surface.ground, nodes)
+        with path.open("wb") as file:
+            file.write(head)
+            for name in names[1:]:
+                with name.open("rb") as part:
+                    copyfileobj(part, file)
+
+
+@dataclass(frozen=True, eq=False)
+class _Patch:
+    """A primitive: facets, and vertices from the first one on, with the ends of their coordinates."""
+
+    n_facets: int
+    first: int
+    n_vertices: int
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+
+
+def _write_shared(
+    file: BinaryIO, surface: Surface, survey: SurfaceSurvey, keys_of: KeysOf, origin: NDArray[np.float64]
+) -> None:
+    """Write all vertices, each once, then facets patch by patch."""
+    start = file.tell()
+    places, place = {}, start + survey.n_vertices * VERTEX_BYTES
+    for key, n in survey.facets.items():
+        places[key] = place
+        place += n * FACET_BYTES
+    for k in range(len(surface.names)):
+        piece = surface.read(k)
+        runs, facets = place_vertices(piece, survey.vertices)
+        for first, points in runs:
+            file.seek(start + first * VERTEX_BYTES)
+            file.write(_local(points, origin).tobytes())
+        for key, rows in facets_by_key(places, keys_of(piece)):
+            file.seek(places[key])
+            file.write(facets[rows].astype("<u4").tobytes())
+            places[key] += len(rows) * FACET_BYTES
+
+
+def _part_patches(shared: Path, vertices: Path, facets: Path, survey: SurfaceSurvey) -> dict[int, _Patch]:
+    """Give each patch vertices of its own, from a file of shared ones into two."""
+    patches, first = {}, 0
+    points = np.memmap(shared, "<f4", "r", shape=(survey.n_vertices, 3))
+    with shared.open("rb") as source, vertices.open("wb") as of_vertices, facets.open("wb") as of_facets:
+        source.seek(survey.n_vertices * VERTEX_BYTES)
         for key, n in survey.facets.items():
-            places[key] = place
-            place += n * FACET_BYTES
-        for k in range(len(surface.names)):
-            piece = surface.read(k)
-            runs, facets = place_vertices(piece, survey.vertices)
-            for first, points in runs:
-                file.seek(start + first * VERTEX_BYTES)
-                file.write(_local(points, origin).tobytes())
-            for key, rows in facets_by_key(places, keys_of(piece)):
-                file.seek(places[key])
-                file.write(facets[rows].astype("<u4").tobytes())
-                places[key] += len(rows) * FACET_BYTES
+            used, corners = np.unique(np.fromfile(source, "<u4", 3 * n), return_inverse=True)
+            own = points[used]
+            of_vertices.write(own.tobytes())
+            of_facets.write(corners.astype("<u4").tobytes())
+            patches[key] = _Patch(n, first, len(used), own.min(axis=0), own.max(axis=0))
+            first += len(used)
+    return patches
 
 
 def _by_building_and_marker(piece: SurfacePiece) -> NDArray[np.int64]:
@@ -133,45 +183,58 @@ def _local(points: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[
     return ((points - origin)[:, [0, 2, 1]] * [1, 1, -1] + 0.0).astype("<f4")
 
 
-def _data_bytes(survey: SurfaceSurvey) -> int:
-    return survey.n_vertices * VERTEX_BYTES + survey.n_facets * FACET_BYTES
+def _head(
+    patches: Mapping[int, _Patch],
+    n_vertices: int,
+    origin: NDArray[np.float64],
+    crs: str,
+    ground: tuple[str, ...],
+    nodes: Mapping[int, list[int]],
+) -> bytes:
+    """Give what comes before vertices and facets; InputError if the file would be longer than GLB allows."""
+    n_facets = sum(patch.n_facets for patch in patches.values())
+    sizes = n_vertices * VERTEX_BYTES, n_facets * FACET_BYTES
+    document = _document(patches, sizes, origin, crs, ground, nodes)
+    head = begin_glb(json.dumps(document, separators=(",", ":")).encode(), sum(sizes))
+    total = len(head) + sum(sizes)
+    if total > MOST_BYTES:
+        raise InputError(
+            f"boundary: {total} bytes as GLB; bound: {MOST_BYTES}; use --format ply, or mesh a part of the region"
+        )
+    return head
 
 
 def _document(
-    survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str, ground: tuple[str, ...]
+    patches: Mapping[int, _Patch],
+    sizes: tuple[int, int],
+    origin: NDArray[np.float64],
+    crs: str,
+    ground: tuple[str, ...],
+    nodes: Mapping[int, list[int]],
 ) -> dict[str, Any]:
-    # Rounding keeps order, so the corners of the box are turned into the exact least and greatest coordinates.
-    box = _local(np.stack((survey.low, survey.high)), origin)
-    split = survey.n_vertices * VERTEX_BYTES
-    position = {
-        "bufferView": 0,
-        "componentType": FLOAT,
-        "count": survey.n_vertices,
-        "type": "VEC3",
-        "min": box.min(axis=0).tolist(),
-        "max": box.max(axis=0).tolist(),
-    }
-    indices, place = [], 0
-    for n in survey.facets.values():
-        accessor = {"bufferView": 1, "componentType": UNSIGNED_INT, "count": 3 * n, "type": "SCALAR"}
-        indices.append(accessor | ({"byteOffset": place} if place else {}))
-        place += n * FACET_BYTES
-    materials = sorted({_of_key(key)[1] for key in survey.facets})
-    primitives: dict[int, list[dict[str, Any]]] = {}
-    for i, (number, marker) in enumerate(map(_of_key, survey.facets)):
-        primitives.setdefault(number, []).append(
-            {
-                "attributes": {"POSITION": 0},
-                "indices": 1 + i,
-                "material": materials.index(marker),
-                "extras": {"marker": int(marker)},
-            }
-        )
-    names = {number: "boundary" if number < 0 else building_name(number) for number in primitives}
-    nodes = [
-        {"mesh": i, "name": name} | ({} if number < 0 else {"extras": {"building": number}})
-        for i, (number, name) in enumerate(names.items())
-    ]
+    """Describe the scene; `nodes` has the patches of each by a key, -1 for the whole boundary."""
+    materials = sorted({_of_key(key)[1] for key in patches})
+    names = {marker: patch_of_key(marker, ground).name for marker in materials}
+    accessors: list[dict[str, Any]] = []
+    position: dict[int, int] = {}  # accessor by first vertex
+    primitives, place = {}, 0
+    for key, patch in patches.items():
+        marker = _of_key(key)[1]
+        if patch.first not in position:
+            position[patch.first] = len(accessors)
+            offset = patch.first * VERTEX_BYTES
+            ends = {"min": patch.low.tolist(), "max": patch.high.tolist()}
+            accessors.append(_accessor(0, offset, FLOAT, patch.n_vertices, "VEC3") | ends)
+        primitives[key] = {
+            "attributes": {"POSITION": position[patch.first]},
+            "indices": len(accessors),
+            "material": materials.index(marker),
+            "extras": {"marker": int(marker)},
+        }
+        accessors.append(_accessor(1, place, UNSIGNED_INT, 3 * patch.n_facets, "SCALAR"))
+        place += patch.n_facets * FACET_BYTES
+    told = {key: _name_node(key, names) for key in nodes}
+    stride = {"byteStride": VERTEX_BYTES} if len(position) > 1 else {}
     return {
         "asset": {
             "version": "2.0",
@@ -180,16 +243,34 @@ def _document(
         },
         "scene": 0,
         "scenes": [{"nodes": list(range(len(nodes)))}],
-        "nodes": nodes,
-        "meshes": [{"name": names[number], "primitives": parts} for number, parts in primitives.items()],
-        "materials": [make_material(marker, patch_of_key(marker, ground).name) for marker in materials],
-        "accessors": [position, *indices],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": split, "target": VERTICES},
-            {"buffer": 0, "byteOffset": split, "byteLength": survey.n_facets * FACET_BYTES, "target": INDICES},
+        "nodes": [{"mesh": i} | node for i, node in enumerate(told.values())],
+        "meshes": [
+            {"name": told[key]["name"], "primitives": [primitives[one] for one in parts]}
+            for key, parts in nodes.items()
         ],
-        "buffers": [{"byteLength": _data_bytes(survey)}],
+        "materials": [make_material(marker, names[marker]) for marker in materials],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteLength": sizes[0], "target": VERTICES} | stride,
+            {"buffer": 0, "byteOffset": sizes[0], "byteLength": sizes[1], "target": INDICES},
+        ],
+        "buffers": [{"byteLength": sum(sizes)}],
     }
+
+
+def _accessor(view: int, offset: int, component: int, count: int, kind: str) -> dict[str, Any]:
+    told = {"bufferView": view, "componentType": component, "count": count, "type": kind}
+    return told | ({"byteOffset": offset} if offset else {})
+
+
+def _name_node(key: int, names: Mapping[int, str]) -> dict[str, Any]:
+    """Name a node; no name ends in a digit, as programs number equal names that way."""
+    if key < 0:
+        return {"name": "boundary"}
+    number, marker = _of_key(key)
+    if number < 0:
+        return {"name": names[marker]}
+    return {"name": f"{building_name(number)}_{names[marker]}", "extras": {"building": number}}
 
 
 FORMAT = Format(
