@@ -32,6 +32,7 @@ from tiler.store.atomic import disk_errors
 VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.pieces.numbering`
 TILE = "tile"  # cell array on request: which tile a cell is of, counted from 0 by name
 RADIUS_RATIO = "radius_ratio"  # cell array on request
+INDEX = "index"  # cell array on request: a facet's building, counted from 0 by number, -1 for none
 CHUNK = 1 << 20  # vertices that are moved at once
 Place = tuple[float, float, float]
 NO_PLACE = (0.0, 0.0, 0.0)
@@ -102,7 +103,7 @@ def write_merged_boundary(
     volumes : sequence of Path
         The VTU pieces of all tiles.
     scalars : bool
-        Add the cell array `TILE`.
+        Add the cell arrays `TILE`, and `INDEX` for readers that keep 32 bits of ``building``, as vtk.js does.
     origin : tuple of float
         Place (m) that coordinates are to count from.
 
@@ -281,7 +282,16 @@ def _scalars(source: _Source, kind: str) -> list[Stream]:
     number = np.dtype(np.int32)
     tile = _joined(TILE, number, source.n_rows, lambda k: np.full(source.n_rows[k], k, number), components=1)
     if kind != "UnstructuredGrid":
-        return [tile]
+        buildings = np.empty(0, np.int64)
+        for k in range(len(source.paths)):
+            buildings = np.union1d(buildings, source.read(k)["CellData"]["building"])
+        buildings = buildings[buildings >= 0]
+
+        def index(k: int) -> NDArray[Any]:
+            found = source.read(k)["CellData"]["building"]
+            return np.where(found < 0, -1, np.searchsorted(buildings, found)).astype(number)
+
+        return [tile, _joined(INDEX, number, source.n_rows, index, components=1)]
     return [tile, _joined(RADIUS_RATIO, np.dtype(np.float32), source.n_rows, quality, components=1)]
 
 

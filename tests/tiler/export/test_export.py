@@ -64,13 +64,17 @@ def test_scalars_to_colour_by_are_added_on_request(small_run: Path, exported: Ex
             {g.GetCellData().GetArrayName(i) for i in range(g.GetCellData().GetNumberOfArrays())}
             for g in (grid, without)
         )
-        assert names - few == ({"tile", "radius_ratio"} if grid is volume else {"tile"})
+        assert names - few == ({"tile", "radius_ratio"} if grid is volume else {"tile", "index"})
     folders = [sorted((small_run / folder).iterdir()) for folder in ("mesh", "boundary")]
     cells = [len(read_vtu(path).mesh.cells) for path in folders[0]]
     facets = [len(read_vtp(path).boundary.facets) for path in folders[1]]
     for grid, sizes in ((volume, cells), (surface, facets)):
         tile = vtk_to_numpy(grid.GetCellData().GetArray("tile"))
         assert np.array_equal(tile, np.repeat(np.arange(4), sizes))
+    number, index = (vtk_to_numpy(surface.GetCellData().GetArray(name)) for name in ("building", "index"))
+    known = np.unique(number[number >= 0])
+    assert (index.dtype, index.max(), index.min()) == (np.int32, len(known) - 1, -1)
+    assert np.array_equal(np.where(index < 0, -1, known[index]), number)
     found = vtk_to_numpy(volume.GetCellData().GetArray("radius_ratio"))
     nodes = vtk_to_numpy(volume.GetCells().GetConnectivityArray()).reshape(-1, 4)
     corners = vtk_to_numpy(volume.GetPoints().GetData())[nodes]
