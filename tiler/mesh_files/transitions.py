@@ -105,8 +105,8 @@ def turn_over(faces: NDArray[Number]) -> NDArray[Number]:
 
 
 def fill_corners(rows: NDArray[Number]) -> NDArray[Number]:
-    """Repeat the first corner of cells or faces (k, w) in the places that have none."""
-    return np.where(rows == NO_CORNER, rows[:, :1], rows)
+    """Repeat the first corner of cells or faces (k, w) in the places that have none, which are the last ones."""
+    return rows if (rows[:, -1] != NO_CORNER).all() else np.where(rows == NO_CORNER, rows[:, :1], rows)
 
 
 def find_seam_sides(
