@@ -17,7 +17,7 @@ from pipeline.data.errors import InputError
 from tiler.cityinput.faces import NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape, check_places
 from tiler.vectors.features import to_objects
 from tiler.vectors.gdal_layer import quote
-from tiler.vectors.wkb import parse_wkb
+from tiler.vectors.wkb import parse_wkb, strip_header
 
 SIGNATURE = b"SQLite format 3\0"
 IDS = ("identificatie", "gml_id", "building_id", "id")  # columns with a building's id, the first that is there
@@ -25,7 +25,6 @@ OUTLINES = "pand"  # layer with outlines in plan
 PART = "part"  # column with the id of the part that a row is, where it is one
 BATCH = 500  # buildings whose geometries are parsed at a time
 _LEVEL = re.compile(r"lod(\d)(\d)?_3d")
-_ENVELOPES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}  # bytes by the code in the header of a geometry
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ def _read_batch(
             columns = "*" if all_columns else quote(one.geometry)
             found = base.execute(f"SELECT {columns} FROM {quote(one.table)} WHERE rowid = ?", (number,))
             row = dict(zip((column[0] for column in found.description), found.fetchone(), strict=True))
-            stripped, fault = _strip(row.pop(one.geometry))
+            stripped, fault = strip_header(row.pop(one.geometry))
             owners.append(str(row.pop(PART, None) or name))
             known = values.setdefault(name, {}).setdefault(owners[-1], {})
             for key, value in row.items():
@@ -139,14 +138,6 @@ def _read_batch(
                     told.append(f"a geometry of {layers[layer].table}: {error}")
             k += 1
         yield ModelBuilding(name, tuple(shapes), faults=tuple(told), attributes=values[name])
-
-
-def _strip(blob: bytes) -> tuple[bytes | None, str]:
-    """Take the header of a GeoPackage's geometry away; None and the reason where there is no sound one."""
-    if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
-        return None, "has no header of a GeoPackage"
-    envelope = _ENVELOPES.get(blob[3] >> 1 & 7)
-    return (None, "has a header of an unknown kind") if envelope is None else (blob[8 + envelope :], "")
 
 
 def _make_faces(geometry: shapely.Geometry, kind: int) -> Faces:

@@ -24,13 +24,13 @@ from tiler.generalisation.rows import LEVELS, Rows, level_word
 from tiler.generalisation.summary import LevelSum, describe_levels
 from tiler.vectors.features import to_objects
 from tiler.vectors.gdal_layer import list_some
+from tiler.vectors.wkb import parse_wkb, strip_header
 
 ROUNDED = 1e-6  # of numbers, as shares
 # m; of the middle of a building from its cell, and from its LoD0C, or of blocks from their cells, as outlines are
 # moved by half of the gap of adjacent buildings.
 IN_CELL, AT_BLOCK = 0.01, ADJACENT / 2
 FLAT = 0.002  # m; heights and places of CityJSON are rounded to a millimetre
-ENVELOPES = (0, 32, 48, 48, 64)  # bytes, by the flags of a geometry of a GeoPackage
 ABOVE = list(pairwise(LEVELS))
 # Kind of fault, and the ids that have it.
 QUERIES = [
@@ -194,9 +194,14 @@ def _scan(base: sqlite3.Connection, query: str) -> Iterator[list[tuple[Any, ...]
         yield rows
 
 
-def _shapes(blobs: Sequence[bytes]) -> NDArray[np.object_]:
-    """Read geometries of a GeoPackage."""
-    return np.asarray(shapely.from_wkb([blob[8 + ENVELOPES[blob[3] >> 1 & 7] :] for blob in blobs]), np.object_)
+def _shapes(blobs: Sequence[object]) -> NDArray[np.object_]:
+    """Read geometries of a GeoPackage; ValueError where one is damaged."""
+    stripped = [strip_header(blob) for blob in blobs]
+    found, _, broken = parse_wkb(to_objects([plain for plain, _ in stripped]))
+    faults = [fault for _, fault in stripped if fault] + list(broken.values())
+    if faults:
+        raise ValueError(f"a geometry: {faults[0]}")
+    return found
 
 
 def _prove_shapes(base: sqlite3.Connection, numbers: Mapping[str, Any]) -> Iterator[Proof]:

@@ -20,6 +20,16 @@ _CURVES = range(8, 15)
 # What GEOS knows polyhedral surfaces, TINs and triangles as: the bytes behind their kind are the same.
 _SURFACES = {15: _MULTIPOLYGON, 16: _MULTIPOLYGON, 17: _POLYGON}
 
+_ENVELOPES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}  # bytes by the code in the header of a GeoPackage's geometry
+
+
+def strip_header(blob: object) -> tuple[bytes | None, str]:
+    """Take the header of a GeoPackage's geometry away; None and the reason where there is no sound one."""
+    if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
+        return None, "has no header of a GeoPackage"
+    envelope = _ENVELOPES.get(blob[3] >> 1 & 7)
+    return (None, "has a header of an unknown kind") if envelope is None else (blob[8 + envelope :], "")
+
 
 def parse_wkb(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], set[int], dict[int, str]]:
     """Parse geometries of unknown origin.

@@ -313,6 +313,12 @@ def test_check_finds_a_change_of_any_field(files: list[str], tmp_path: Path) -> 
                 base.execute(f"update {layer} set {name} = ? where rowid = ?", (other, row[0]))
                 unseen += [(layer, name)] if check_generalisation(out).ok else []
                 base.execute(f"update {layer} set {name} = ? where rowid = ?", (value, row[0]))
+        rowid, blob = base.execute("select rowid, geom from lod0b limit 1").fetchone()
+        for damaged in (blob[:60], blob[:3] + b"\x0f" + blob[4:], b"GP", "no geometry", None):
+            base.execute("update lod0b set geom = ? where rowid = ?", (damaged, rowid))
+            with pytest.raises(CityError, match="no result of citystitch generalise"):
+                check_generalisation(out)
+        base.execute("update lod0b set geom = ? where rowid = ?", (blob, rowid))
     for path, texts in (
         (out.with_suffix(".levels.json"), [r'"volume_error": ', r'"cells": ', r'"polygons": ']),
         (out.with_suffix(".city.json"), [r'"height":', r'"level":"', r'"children":\["', r'"vertices":\[\n\[']),
