@@ -2,8 +2,7 @@
 
 The first two are the paper's studies (its section 2.2): (a) cost against the number of cells, (b) against that of
 buildings. What is measured is kept in docs/benchmarks.json, a study each, and docs/benchmarks.md and its pictures
-are written from that: `python -m tests.benchmarks.bench cells` measures one study anew and leaves the others, and
-`--large` adds the city of 10 km to those of area and workers (11 and 36 minutes in all).
+are written from that: `python -m tests.benchmarks.bench cells` measures one study anew and leaves the others.
 """
 
 import argparse
@@ -12,11 +11,9 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
@@ -24,21 +21,16 @@ from typing import Any
 
 import numpy as np
 
-from tests.benchmarks.bench_report import AT_ONCE, CHOICE, DOCS, MEASURED, step_seconds, write_report
+from tests.benchmarks.bench_report import CHOICE, DOCS, MEASURED, step_seconds, write_report
 from tests.benchmarks.runs import COMMAND, citystitch, record_of, set_aside
 from tiler.monitoring.events import read_events
 
 KEPT = DOCS / "benchmarks.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
 BUILDINGS = (100, 300, 1000, 3000, 10_000, 20_000, 50_000)
-SIDES = (1000, 2000, 3000, 5000)  # m
-LARGEST = (10_000,) if "--large" in sys.argv else ()  # m
+SIDES = (1000, 2000, 3000, 5000, 10_000)  # m
 TILES_A_SIDE = (8, 16, 32)
 TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
-# What a run is called, its command, its workers and further options.
-Kind = tuple[str, str, int, tuple[str, ...]]
-KINDS: tuple[Kind, ...] = (("one process", "run", 0, ()), ("2 workers", "run", 2, ()))
-ONE_WORKER: Kind = ("1 worker", "run", 1, ())
 PACKAGES = ("pipeline", "stitch", "tiler")
 WAYS = (
     "",
@@ -107,18 +99,13 @@ def study_buildings(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(c) 480 buildings a km2 on more and more of them, one worker; each step the median of 3 runs in turn."""
+    """(c) 480 buildings a km2 on more and more of them, one worker."""
     rows = []
-    for side in (SIDES + LARGEST) * 3:
+    for side in SIDES:
         city = cities.make(side, round(480 * side**2 / 1e6))
         found = measure(city, out, "--tile-size", "500", "--workers", "1", cores=2)
         rows.append(found | {"area": side**2 / 1e6, "inner": inner_seconds(out)})
-    middle = middle_ones(rows, "area")
-    for row in middle:
-        for part in ("steps", "inner"):
-            some = [other[part] for other in rows if other["area"] == row["area"]]
-            row[part] = {name: round(median(one[name] for one in some), 4) for name in row[part]}
-    return middle
+    return rows
 
 
 def inner_seconds(out: Path) -> dict[str, float]:
@@ -151,43 +138,6 @@ def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
         found = measure(city, out, "--tile-size", "150", "--workers", "2", cores=2)
         rows.append(found | {"tiles a side": n})
     return rows
-
-
-def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(d) Cities of 2.5 km and more serially and with workers.
-
-    Runs take turns. The time is that of the command, with all that it imports.
-    """
-    rows = []
-    for side in (2500, 5000, *LARGEST):
-        city = cities.make(side, 480 * side**2 // 10**6)
-        for _ in range(3 if side in LARGEST else 5):
-            for told, command, n, more in KINDS if side in LARGEST else (*KINDS, ONE_WORKER):
-                found = measure(city, out, "--workers", str(n), *more, cores=2, command=command)
-                rows.append(found | {"total": found["command"], "run as": told, "side": side})
-            rows.append(measure_two(city, out) | {"run as": AT_ONCE, "side": side})
-    return middle_ones(rows, "side", "run as")
-
-
-def measure_two(city: Path, out: Path) -> dict[str, Any]:
-    """Mesh a city twice at once, in one process each; what the first says, with the mean time of both."""
-    with ThreadPoolExecutor(2) as pool:
-        places = [out.with_name(f"{out.name}-{k}") for k in range(2)]
-        runs = [pool.submit(measure, city, place, "--workers", "0", cores=2) for place in places]
-        first, second = (run.result() for run in runs)
-    return first | {"total": (first["command"] + second["command"]) / 2}
-
-
-def study_waits(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """What two workers lose to one process: a longer start, longer tasks, and time without one."""
-    rows = []
-    for side in (2500, 5000):
-        city = cities.make(side, 480 * side**2 // 10**6)
-        for told, command, n, more in KINDS * 3:
-            found = measure(city, out, "--workers", str(n), *more, cores=2, command=command)
-            row = {"run as": told, "side": side, "total": found["command"]}
-            rows.append(row | find_waits(out, max(n, 1), time.time() - found["command"]))
-    return middle_ones(rows, "side", "run as")
 
 
 def find_waits(out: Path, workers: int, began: float) -> dict[str, float]:
@@ -225,7 +175,7 @@ def middle_ones(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, An
 
 
 def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(e) The city of 2.5 km with tiles of several sizes, two workers."""
+    """(d) The city of 2.5 km with tiles of several sizes, two workers."""
     city = cities.make(2500, 3000)
     return [
         measure(city, out, "--tile-size", str(size), "--workers", "2", cores=2) | {"tile size": size}
@@ -238,27 +188,26 @@ def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
     city = cities.make(2500, 3000)
     rows = []
     for size in (10.0, 5.0, 2.5):
-        for n, told in ((0, "one process"), (2, "2 workers")) * 3:
+        for n, told in ((0, "one process"), (2, "2 workers")) * (3 if size > 2.5 else 1):
             found = measure(city, out, "--mesh-size", str(size), "--workers", str(n), cores=2)
             rows.append(found | {"total": found["command"], "run as": told, "mesh size": size})
     return middle_ones(rows, "mesh size", "run as")
 
 
 def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """Both meshers at 10 and 5 m, and a dense cloud; serially, tiles of the default size; the middle one of 3.
+    """Both meshers at 10 and 5 m, and a dense cloud; serially, tiles of the default size.
 
     Cities of 16 tiles at 10 m and some 30 at 5 m, and 36 million points: in less, compiled code that is read for
     the first time counts.
     """
     wide, city, dense = cities.make(5000, 12_000), cities.make(3000, 4320), cities.make(1500, 1080, 16.0)
     rows = []
-    for _ in range(3):
-        for mesher in ("adaptive", "layered"):
-            for size, place in ((10.0, wide), (5.0, city)):
-                found = measure(place, out, "--mesher", mesher, "--mesh-size", str(size), "--workers", "0")
-                rows.append(found | {"mesher": f"{mesher}, {size:g} m"})
-        rows.append(measure(dense, out, "--workers", "0") | {"mesher": "adaptive, 10 m, 1.5 km, 16 points a m2"})
-    return middle_ones(rows, "mesher")
+    for mesher in ("adaptive", "layered"):
+        for size, place in ((10.0, wide), (5.0, city)):
+            found = measure(place, out, "--mesher", mesher, "--mesh-size", str(size), "--workers", "0")
+            rows.append(found | {"mesher": f"{mesher}, {size:g} m"})
+    rows.append(measure(dense, out, "--workers", "0") | {"mesher": "adaptive, 10 m, 1.5 km, 16 points a m2"})
+    return rows
 
 
 def study_ways(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -269,7 +218,7 @@ def study_ways(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(f) Samples of a serial run of the city of 2.5 km by our function that was at work, with py-spy.
+    """Samples of a serial run of the city of 2.5 km by our function that was at work, with py-spy.
 
     The main thread's alone, those in which it waits for zarr's threads among them.
     """
@@ -379,8 +328,6 @@ STUDIES: Mapping[str, Study] = {
     "buildings": study_buildings,
     "area": study_area,
     "driver": study_driver,
-    "workers": study_workers,
-    "waits": study_waits,
     "tiles": study_tiles,
     "fine": study_fine,
     "rates": study_rates,
@@ -396,7 +343,6 @@ def main() -> None:
     told = "Measure studies anew, and write docs/benchmarks.md of all that is known."
     parser = argparse.ArgumentParser("python -m tests.benchmarks.bench", description=told, allow_abbrev=False)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"{', '.join(STUDIES)}; all by default")
-    parser.add_argument("--large", action="store_true", help="have the city of 10 km in area and workers, too")
     names = parser.parse_args().studies or list(STUDIES)
     if unknown := sorted(set(names) - STUDIES.keys()):
         parser.error(f"no study {unknown[0]!r}; there are {', '.join(STUDIES)}")

@@ -19,7 +19,6 @@ LEAST_INNER = 0.004  # s: events tell thousandths
 MEASURED = "measured"  # day of each study, beside the studies
 # Key and title of a table's first column, where they are not the study's own key.
 TITLES = {"cells": ("mesh size", "mesh size (m)"), "area": ("area", "area (km²)")}
-AT_ONCE = "one process, beside another such run"
 OTHERS = "<!-- exports -->"  # what `make bench-exports` has written begins here
 
 Rows = list[dict[str, Any]]
@@ -140,7 +139,7 @@ def _inner(rows: Rows) -> list[str]:
     areas = [float(row["area"]) for row in rows]
     lines = [
         "A large region has more tiles with others all around, which read more than those at its border. Each of",
-        "these alone takes (ms; the median of a run, and of the runs):",
+        "these alone takes (ms; the median of a run):",
         "",
         f"| stage | {' | '.join(f'{area:g} km²' for area in areas)} | exponent against area |",
         "|---" * (2 + len(rows)) + "|",
@@ -228,34 +227,6 @@ def _driver(rows: Rows) -> list[str]:
     return [*_runs(rows, "tiles a side"), "", f"The driver takes {', '.join(told)}."]
 
 
-def _workers(rows: Rows) -> list[str]:
-    lines = []
-    for side in dict.fromkeys(row["side"] for row in rows):
-        lines += [*_runs([row for row in rows if row["side"] == side], "run as"), ""]
-    return [*lines, *_speedups(rows, "side", "km", 1000, "2 workers"), "", *_limit(rows)]
-
-
-def _limit(rows: Rows) -> list[str]:
-    """What two cores give at best: two runs in one process each, which wait for nothing, and have a start each."""
-    found = {(row["side"], row["run as"]): row for row in rows}
-    told = []
-    for side in dict.fromkeys(row["side"] for row in rows):
-        alone, beside = (found[side, kind]["total"] for kind in ("one process", AT_ONCE))
-        told.append(f"{2 * alone / beside:.2f} at {side / 1000:g} km")
-    return [f"What two cores give at best, by two runs at once that share nothing: {', '.join(told)}."]
-
-
-def _waits(rows: Rows) -> list[str]:
-    lines = [
-        "| city | run as | whole command | before the first task | tasks together | without a task, a worker |",
-        "|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        seconds = " | ".join(f"{row[key]:.2f} s" for key in ("total", "start", "tasks", "idle"))
-        lines.append(f"| {row['side'] / 1000:g} km | {row['run as']} | {seconds} |")
-    return lines
-
-
 def _fine(rows: Rows) -> list[str]:
     two = [row for row in rows if row["run as"] == "2 workers"]
     return [*_runs(two, "mesh size", "mesh size (m)"), "", *_speedups(rows, "mesh size", "m", 1, "2 workers")]
@@ -277,14 +248,6 @@ def _table(left: str, right: str, rows: Iterable[tuple[str, str]]) -> list[str]:
     return [f"| {left} | {right} |", "|---|---|", *(f"| {one} | {other} |" for one, other in rows)]
 
 
-def _shares(rows: Rows) -> list[str]:
-    lines = [f"| step | {' | '.join(row['run as'] for row in rows)} |", "|---" * (1 + len(rows)) + "|"]
-    for step in (*STEPS, "rest"):
-        parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
-        lines.append(f"| {step} | " + " | ".join(parts) + " |")
-    return lines
-
-
 # Of each study: its title, what was run, and what is made of its rows.
 SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
@@ -302,8 +265,7 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "area",
         "(c) Area",
-        "480 buildings a km², tiles of 500 m, one worker; of 3 runs in turn the middle one, the median of each "
-        "step.",
+        "480 buildings a km², tiles of 500 m, one worker.",
         lambda rows: [*_growth(rows, "area", "area"), "", *_inner(rows)],
     ),
     (
@@ -313,43 +275,22 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
         _driver,
     ),
     (
-        "workers",
-        "(d) Workers",
-        "Cities with 480 buildings a km²; the time of the command, the middle one of 5 runs, of 3 above 5 km, in "
-        "turn.",
-        _workers,
-    ),
-    (
-        "waits",
-        "What two workers lose",
-        "By the events of runs in turn; the middle one of 3 by the time of the command. Imports take most of what "
-        "comes\nbefore the first task. Tasks take longer beside another one, and beside Dask's driver. "
-        "A\nworker is without one where all wait for the last tile of a stage, and between one task and the next.",
-        _waits,
-    ),
-    (
         "tiles",
-        "(e) Tile size",
+        "(d) Tile size",
         "The city of 2.5 km, two workers.",
         lambda rows: _runs(rows, "tile size", "tile size (m)"),
     ),
     (
         "fine",
         "Fine meshes",
-        "The city of 2.5 km, two workers; the time of the command, the middle one of 3 runs.",
+        "The city of 2.5 km, two workers; the time of the command, the middle one of 3 runs (2.5 m: one run).",
         _fine,
-    ),
-    (
-        "workers",
-        "(f) Shares",
-        "Of the city of 2.5 km.",
-        lambda rows: _shares([r for r in rows if r["side"] == rows[0]["side"] and r["run as"] != AT_ONCE]),
     ),
     (
         "rates",
         "Rates",
-        "Cities with 480 buildings a km² and 1.5 points a m², of 5 km at 10 m and of 3 km at 5 m, serial; the "
-        "middle one of 3\nruns. *Step 3* is what stages `seams` and `columns` compute (3.1 to 3.5), then all that "
+        "Cities with 480 buildings a km² and 1.5 points a m², of 5 km at 10 m and of 3 km at 5 m, "
+        "serial. *Step 3* is what stages `seams` and `columns` compute (3.1 to 3.5), then all that "
         "they do, with what they read and\nwrite of the store; the layers of roofs, which `model` chooses, count "
         "in both. *Written* are cells a second into VTU pieces.",
         _rates,
