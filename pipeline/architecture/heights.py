@@ -18,8 +18,6 @@ def house_heights(house: House, xy: Array) -> Array:
 
     Parameters
     ----------
-    house : House
-        Its parameters.
     xy : float64, (n, 2)
         Places in the CRS of the town (m).
 

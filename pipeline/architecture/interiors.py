@@ -28,8 +28,6 @@ def make_interior(house: House, level: str) -> list[Room]:
 
     Parameters
     ----------
-    house : House
-        Its parameters.
     level : str
         ``"0"``: the floor of each storey; ``"1"``: one volume up to the roof; ``"2.2"``: a volume a storey, and
         the attic where it is 1.5 m high or more; ``"2.3"``: the attic with its dormers.

@@ -42,21 +42,11 @@ DETAILS = {
 
 @dataclass(frozen=True)
 class Volume:
-    """A house, or a part of it, at a level of detail.
+    """A house, or a part of it, at a level of detail."""
 
-    Attributes
-    ----------
-    part : int
-        Index into `House.parts`; -1 for the main body, or all of the house.
-    closed : bool
-        Whether its surfaces are those of a solid.
-    surfaces : list of Surface
-        In the CRS of the town (m).
-    """
-
-    part: int
-    closed: bool
-    surfaces: list[Surface]
+    part: int  #: index into `House.parts`; -1 for the main body, or all of the house
+    closed: bool  #: whether its surfaces are those of a solid
+    surfaces: list[Surface]  #: in the CRS of the town (m)
 
 
 def make_level(
@@ -71,8 +61,6 @@ def make_level(
 
     Parameters
     ----------
-    house : House
-        Its parameters.
     level : str
         One of `LEVELS`.
     footprint : str

@@ -14,35 +14,19 @@ _STREET = 12.0  # m between two rows
 
 @dataclass(frozen=True)
 class Lot:
-    """A lot.
+    """A lot."""
 
-    Attributes
-    ----------
-    i, j : int
-        Its numbers: eastwards and northwards.
-    x, y : float
-        Its centre (m).
-    size : float
-        Diameter of the circle that a house on it has to keep to (m); of a row, its width.
-    rotation : float
-        Of the house (degrees).
-    party : tuple of int
-        Walls that its house shares with neighbours: it fills the lot between them.
-    use : str
-        ``"house"``, ``"street"`` or ``"court"``.
-    corner : bool
-        Whether houses of another side of its block stand beside its back.
-    """
-
+    #: its numbers: eastwards and northwards
     i: int
     j: int
+    #: its centre (m)
     x: float
     y: float
-    size: float
-    rotation: float
-    party: tuple[int, ...] = ()
-    use: str = "house"
-    corner: bool = False
+    size: float  #: diameter of the circle that a house on it has to keep to (m); of a row, its width
+    rotation: float  #: of the house (degrees)
+    party: tuple[int, ...] = ()  #: walls that its house shares with neighbours: it fills the lot between them
+    use: str = "house"  #: ``"house"``, ``"street"`` or ``"court"``
+    corner: bool = False  #: whether houses of another side of its block stand beside its back
 
 
 def list_lots(

@@ -12,136 +12,78 @@ Rings = tuple[tuple[Flat, ...], ...]  # border counter-clockwise, then holes clo
 
 @dataclass(frozen=True)
 class Opening:
-    """A window or a door in a wall.
+    """A window or a door in a wall."""
 
-    Attributes
-    ----------
-    kind : str
-        ``"window"`` or ``"door"``.
-    wall : int
-        Its wall, as of `House`.
-    along, sill : float
-        Its lower left corner, seen from outside: along the wall, and above the ground (m).
-    width, height : float
-        Its size (m).
-    """
-
-    kind: Literal["window", "door"]
-    wall: int
+    kind: Literal["window", "door"]  #: ``"window"`` or ``"door"``
+    wall: int  #: its wall, as of `House`
+    #: its lower left corner, seen from outside: along the wall, and above the ground (m)
     along: float
     sill: float
+    #: its size (m)
     width: float
     height: float
 
 
 @dataclass(frozen=True)
 class Dormer:
-    """A dormer with a flat or a gabled roof.
+    """A dormer with a flat or a gabled roof."""
 
-    Attributes
-    ----------
-    side : int
-        Wall above whose eaves it stands.
-    along, up : float
-        Left end of its front along that wall, and distance of the front from the wall in plan (m).
-    width, height : float
-        Of its front wall (m).
-    rise : float
-        Of its gabled roof (m); 0 for a flat one.
-    window : float
-        Width and height of the window in the front, as a share of the front's.
-    """
-
-    side: int
+    side: int  #: wall above whose eaves it stands
+    #: left end of its front along that wall, and distance of the front from the wall in plan (m)
     along: float
     up: float
+    #: of its front wall (m)
     width: float
     height: float
-    rise: float = 0.0
-    window: float = 0.6
+    rise: float = 0.0  #: of its gabled roof (m); 0 for a flat one
+    window: float = 0.6  #: width and height of the window in the front, as a share of the front's
 
 
 @dataclass(frozen=True)
 class Chimney:
-    """A chimney.
+    """A chimney."""
 
-    Attributes
-    ----------
-    side : int
-        Wall above whose eaves it stands.
-    along, up : float
-        Its lower left corner in plan, along that wall and away from it (m).
-    width : float
-        Of its sides (m).
-    top : float
-        Its height above the highest place of the roof (m).
-    """
-
-    side: int
+    side: int  #: wall above whose eaves it stands
+    #: its lower left corner in plan, along that wall and away from it (m)
     along: float
     up: float
-    width: float
-    top: float
+    width: float  #: of its sides (m)
+    top: float  #: its height above the highest place of the roof (m)
 
 
 @dataclass(frozen=True)
 class RoofWindow:
-    """A window in a roof.
+    """A window in a roof."""
 
-    Attributes
-    ----------
-    side, along, up
-        As of a chimney.
-    width, depth : float
-        Its size in plan, along the wall and away from it (m).
-    """
-
+    #: as of a chimney
     side: int
     along: float
     up: float
+    #: its size in plan, along the wall and away from it (m)
     width: float
     depth: float
 
 
 @dataclass(frozen=True)
 class Roof:
-    """A roof.
+    """A roof."""
 
-    Attributes
-    ----------
-    shape : str
-        One of `ROOF_SHAPES`. The ridge of a gabled or a hipped one goes along the front; a shed rises to the back.
-    rise : float
-        From the eaves to the highest place (m).
-    overhang : float
-        How far it reaches beyond the front and the back, measured in plan (m); all ends of a hipped or pyramidal
-        roof are at one height.
-    """
-
+    #: one of `ROOF_SHAPES`. The ridge of a gabled or a hipped one goes along the front; a shed rises to the back
     shape: RoofShape
-    rise: float = 0.0
+    rise: float = 0.0  #: from the eaves to the highest place (m)
+    #: how far it reaches beyond the front and the back, measured in plan (m); all ends of a hipped or pyramidal
+    #: roof are at one height
     overhang: float = 0.0
 
 
 @dataclass(frozen=True)
 class BuildingPart:
-    """A lower part with a flat roof that stands at a wall.
+    """A lower part with a flat roof that stands at a wall."""
 
-    Attributes
-    ----------
-    kind : str
-        ``"garage"`` or ``"alcove"``.
-    wall : int
-        The wall, as of `House`.
-    along : float
-        Its left end along the wall, seen from outside (m).
-    width, depth, height : float
-        Its size: along the wall, away from it, and upwards (m).
-    """
-
-    kind: Literal["garage", "alcove"]
-    wall: int
-    along: float
+    kind: Literal["garage", "alcove"]  #: ``"garage"`` or ``"alcove"``
+    wall: int  #: the wall, as of `House`
+    along: float  #: its left end along the wall, seen from outside (m)
+    #: its size: along the wall, away from it, and upwards (m)
     width: float
     depth: float
     height: float
@@ -151,35 +93,6 @@ class BuildingPart:
 class House:
     """A building: everything that its geometry is made of.
 
-    Attributes
-    ----------
-    id : str
-        ``UUID_`` and a UUID: XML takes no id that begins with a digit.
-    x, y, z : float
-        Lower left corner of its front, in the CRS of the town (m).
-    rotation : float
-        From the x axis to the front, counter-clockwise (degrees).
-    length, width : float
-        Of the front, and away from it (m).
-    height : float
-        From the ground to the eaves (m).
-    storeys : int
-        Number of storeys below the eaves.
-    embrasure : float
-        How deep windows and doors lie in the wall (m).
-    wall_thickness : float
-        Of outer walls (m), for interiors.
-    roof : Roof
-        The roof.
-    parts, dormers, chimneys, roof_windows, openings : tuple
-        What it has of these.
-    year : int
-        Of construction.
-    use : str
-        What it is used for.
-    plan : tuple
-        Outline of the main body with its courtyards in its frame, of any form; none for a rectangle.
-
     Notes
     -----
     Walls are numbered along the outline: those of a rectangle are the front, the right side, the back and the
@@ -187,25 +100,29 @@ class House:
     rise from wall 0, are one plane.
     """
 
-    id: str
+    id: str  #: ``UUID_`` and a UUID: XML takes no id that begins with a digit
+    #: lower left corner of its front, in the CRS of the town (m)
     x: float
     y: float
     z: float
-    rotation: float
+    rotation: float  #: from the x axis to the front, counter-clockwise (degrees)
+    #: of the front, and away from it (m)
     length: float
     width: float
-    height: float
-    storeys: int
-    embrasure: float
-    wall_thickness: float
-    roof: Roof
+    height: float  #: from the ground to the eaves (m)
+    storeys: int  #: number of storeys below the eaves
+    embrasure: float  #: how deep windows and doors lie in the wall (m)
+    wall_thickness: float  #: of outer walls (m), for interiors
+    roof: Roof  #: the roof
+    #: what it has of these
     parts: tuple[BuildingPart, ...] = ()
     dormers: tuple[Dormer, ...] = ()
     chimneys: tuple[Chimney, ...] = ()
     roof_windows: tuple[RoofWindow, ...] = ()
     openings: tuple[Opening, ...] = ()
-    year: int = 2000
-    use: str = "residential"
+    year: int = 2000  #: of construction
+    use: str = "residential"  #: what it is used for
+    #: outline of the main body with its courtyards in its frame, of any form; none for a rectangle
     plan: Rings = ()
 
     @property

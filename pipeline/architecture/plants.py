@@ -6,30 +6,22 @@ from dataclasses import dataclass
 
 from pipeline.architecture.lots import list_corners, lot_random
 
+SIDES = 8  # of the rings of a crown
+
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree whose crown is an ellipsoid.
+    """A tree whose crown is an ellipsoid."""
 
-    Attributes
-    ----------
-    i, j : int
-        Its numbers: those of the lot whose lower left corner it stands at.
-    x, y, z : float
-        Its foot, in the CRS of the town (m).
-    height : float
-        From its foot to its top (m).
-    radius : float
-        Of its crown (m), which begins at a third of the height.
-    """
-
+    #: its numbers: those of the lot whose lower left corner it stands at
     i: int
     j: int
+    #: its foot, in the CRS of the town (m)
     x: float
     y: float
     z: float
-    height: float
-    radius: float
+    height: float  #: from its foot to its top (m)
+    radius: float  #: of its crown (m), which begins at a third of the height
 
     @property
     def middle(self) -> float:
@@ -67,13 +59,13 @@ def draw_trees(
             yield Tree(i, j, x, y, round(float(ground(x, y)), 3), height, radius)
 
 
-def crown_rings(tree: Tree, sides: int = 8) -> list[list[tuple[float, float, float]]]:
+def crown_rings(tree: Tree) -> list[list[tuple[float, float, float]]]:
     """Rings of a crown from below, counter-clockwise from above; the first and the last are one place (m)."""
     bottom, top = (tree.x, tree.y, tree.z + tree.height / 3), (tree.x, tree.y, tree.z + tree.height)
     rings = [[bottom]]
     for turn in (-0.25, 0.0, 0.25):  # of pi, from the middle
         far, up = tree.radius * math.cos(math.pi * turn), tree.half_height * math.sin(math.pi * turn)
-        angles = [math.tau * k / sides for k in range(sides)]
+        angles = [math.tau * k / SIDES for k in range(SIDES)]
         rings.append(
             [
                 (tree.x + far * math.cos(angle), tree.y + far * math.sin(angle), tree.middle + up)

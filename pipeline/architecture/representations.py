@@ -46,33 +46,15 @@ _SHARES = {"H1": 0.0, "H2": 1 / 3, "H3": 0.5, "H4": 2 / 3, "H5": 1.0}
 
 @dataclass(frozen=True)
 class Representation:
-    """A representation of a house.
+    """A representation of a house."""
 
-    Attributes
-    ----------
-    name : str
-        Of its file, as Random3Dcity names it.
-    level : str
-        One of `pipeline.architecture.levels.LEVELS`, or of `pipeline.architecture.interiors.INTERIORS`.
-    walls : str
-        One of `WALLS_AT`; empty for interiors.
-    height : str
-        One of `HEIGHTS`, where levels 0 and 1 have one.
-    kind : str
-        ``"surfaces"`` without semantics, ``"semantics"``: surfaces with it, or ``"solid"``.
-    dormers : bool
-        Whether level 2.3 has dormers and chimneys.
-    interior : bool
-        Whether it is the inside.
-    """
-
-    name: str
-    level: str
-    walls: str = "F0"
-    height: str = ""
-    kind: str = "semantics"
-    dormers: bool = True
-    interior: bool = False
+    name: str  #: of its file, as Random3Dcity names it
+    level: str  #: one of `pipeline.architecture.levels.LEVELS`, or of `pipeline.architecture.interiors.INTERIORS`
+    walls: str = "F0"  #: one of `WALLS_AT`; empty for interiors
+    height: str = ""  #: one of `HEIGHTS`, where levels 0 and 1 have one
+    kind: str = "semantics"  #: ``"surfaces"`` without semantics, ``"semantics"``: surfaces with it, or ``"solid"``
+    dormers: bool = True  #: whether level 2.3 has dormers and chimneys
+    interior: bool = False  #: whether it is the inside
 
 
 def list_representations() -> list[Representation]:

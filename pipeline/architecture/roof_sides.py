@@ -20,27 +20,14 @@ LEAST_OUT = 0.05  # m, beyond the lowest wall of a shed, that a plan may reach
 
 @dataclass(frozen=True)
 class RoofSide:
-    """A plane of a roof.
+    """A plane of a roof."""
 
-    Attributes
-    ----------
-    wall : int
-        Wall at its eaves.
-    slope : float
-        Metres up for each metre away from the wall.
-    ring : tuple of (float, float)
-        Its corners, counter-clockwise from above: along the wall, and away from it (m).
-    holes : tuple of such rings
-        Courtyards in it, clockwise.
-    rises : tuple of float
-        Height of each corner above the eaves (m): nodes of a skeleton that are closer than 5 mm are one, and lie
-        off the plane by as much at most. None where corners lie on it.
-    """
-
-    wall: int
-    slope: float
-    ring: tuple[Flat, ...]
-    holes: Rings = ()
+    wall: int  #: wall at its eaves
+    slope: float  #: metres up for each metre away from the wall
+    ring: tuple[Flat, ...]  #: its corners, counter-clockwise from above: along the wall, and away from it (m)
+    holes: Rings = ()  #: courtyards in it, clockwise
+    #: height of each corner above the eaves (m): nodes of a skeleton that are closer than 5 mm are one, and lie
+    #: off the plane by as much at most. None where corners lie on it
     rises: tuple[float, ...] = ()
 
     @property

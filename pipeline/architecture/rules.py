@@ -15,21 +15,12 @@ _TRIES = 100  # draws of a normal distribution until one lies within its limits
 
 @dataclass(frozen=True)
 class Distribution:
-    """How a parameter is drawn.
+    """How a parameter is drawn."""
 
-    Attributes
-    ----------
-    kind : str
-        ``"constant"``, ``"uniform"``, ``"normal"`` or ``"choice"``.
-    values : tuple
-        The constant; least and greatest; mean, standard deviation, least and greatest; or what is chosen from.
-    weights : tuple of float
-        Of each choice, summed up and over their sum.
-    """
-
-    kind: str
+    kind: str  #: ``"constant"``, ``"uniform"``, ``"normal"`` or ``"choice"``
+    #: the constant; least and greatest; mean, standard deviation, least and greatest; or what is chosen from
     values: tuple[Value, ...]
-    weights: tuple[float, ...] = ()
+    weights: tuple[float, ...] = ()  #: of each choice, summed up and over their sum
 
     def draw(self, rng: np.random.Generator) -> Value:
         """Draw a value."""

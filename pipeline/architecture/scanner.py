@@ -23,25 +23,14 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Pulses:
-    """Pulses as straight lines: the place ``x + east h, y + north h`` at height ``h`` above the lowest ground.
+    """Pulses as straight lines: the place ``x + east h, y + north h`` at height ``h`` above the lowest ground."""
 
-    Attributes
-    ----------
-    x, y : float64, (n,)
-        Where they would meet the lowest ground (m).
-    east : float64, (n,)
-        Shift towards the sensor for each metre up.
-    north : float
-        The same along the strip.
-    cell : Cell
-        What they are drawn in.
-    """
-
+    #: (n,): where they would meet the lowest ground (m)
     x: Array
     y: Array
-    east: Array
-    north: float
-    cell: "Cell"
+    east: Array  #: (n,): shift towards the sensor for each metre up
+    north: float  #: the same along the strip
+    cell: "Cell"  #: what they are drawn in
 
     def at(self, h: Array) -> tuple[Array, Array]:
         """Give the places at heights above the lowest ground."""
@@ -54,20 +43,13 @@ class Pulses:
 
 @dataclass(frozen=True)
 class Cell:
-    """A square of ``side`` times ``side`` smaller ones, row by row, with a pulse each.
+    """A square of ``side`` times ``side`` smaller ones, row by row, with a pulse each."""
 
-    Attributes
-    ----------
-    west, south, size : float
-        Lower left corner and side (m).
-    side : int
-        Number of pulses along a side.
-    """
-
+    #: lower left corner and side (m)
     west: float
     south: float
     size: float
-    side: int
+    side: int  #: number of pulses along a side
 
     def places(self, jitter: Array) -> tuple[Array, Array]:
         """Give x and y of the pulses by their places within the smaller squares, of 0 to 1: float64, (n, 2)."""
@@ -90,30 +72,15 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """Flat faces in space.
+    """Flat faces in space."""
 
-    Attributes
-    ----------
-    corners : float64, (m, 3)
-        Of their borders, one face after the other (m).
-    start : int64, (n,)
-        First corner of each.
-    normal : float64, (n, 3)
-        Normals of length 1.
-    offset : float64, (n,)
-        Of the planes: ``normal . place``.
-    axes : int64, (n, 2)
-        The two axes that the outline is told in: those that the normal is least along.
-    outlines : object, (n,)
-        Polygons in these axes, with holes.
-    """
-
-    corners: Array
-    start: NDArray[np.int64]
-    normal: Array
-    offset: Array
+    corners: Array  #: (m, 3): of their borders, one face after the other (m)
+    start: NDArray[np.int64]  #: (n,): first corner of each
+    normal: Array  #: (n, 3): normals of length 1
+    offset: Array  #: (n,): of the planes: ``normal . place``
+    #: (n, 2): the two axes that the outline is told in: those that the normal is least along
     axes: NDArray[np.int64]
-    outlines: NDArray[np.object_]
+    outlines: NDArray[np.object_]  #: (n,): polygons in these axes, with holes
 
 
 def strips_over(west: float, east: float) -> range:
@@ -158,8 +125,6 @@ def meet_faces(faces: Faces, seen: Array, pulses: Pulses) -> Array:
 
     Parameters
     ----------
-    faces : Faces
-        The faces.
     seen : float64, (n, 4)
         Their boxes as of `aimed_boxes`.
     pulses : Pulses

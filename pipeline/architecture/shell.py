@@ -28,22 +28,15 @@ from pipeline.architecture.surfaces import (
 
 @dataclass(frozen=True)
 class Detail:
-    """What a shell shows.
+    """What a shell shows."""
 
-    Attributes
-    ----------
-    dormers, chimneys, overhangs, roof_windows, openings : bool
-        Each of these.
-    embrasures : bool
-        Whether windows and doors lie deep in the wall; else they are flush with it.
-    """
-
+    #: each of these
     dormers: bool = False
     chimneys: bool = False
     overhangs: bool = False
     roof_windows: bool = False
     openings: bool = False
-    embrasures: bool = False
+    embrasures: bool = False  #: whether windows and doors lie deep in the wall; else they are flush with it
 
 
 def make_shell(house: House, detail: Detail) -> list[Surface]:

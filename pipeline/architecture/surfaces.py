@@ -22,21 +22,11 @@ GROUND, WALL, ROOF, WINDOW, DOOR, CLOSURE = (
 
 @dataclass
 class Surface:
-    """A polygon in space.
+    """A polygon in space."""
 
-    Attributes
-    ----------
-    kind : str
-        As CityGML names it: `GROUND`, `WALL`, `ROOF`, `WINDOW`, `DOOR` or `CLOSURE`.
-    border : list of (float, float, float)
-        Its corners, counter-clockwise as seen from outside (m).
-    holes : list of such lists
-        Clockwise.
-    """
-
-    kind: str
-    border: list[Point]
-    holes: list[list[Point]]
+    kind: str  #: as CityGML names it: `GROUND`, `WALL`, `ROOF`, `WINDOW`, `DOOR` or `CLOSURE`
+    border: list[Point]  #: its corners, counter-clockwise as seen from outside (m)
+    holes: list[list[Point]]  #: clockwise
 
     def cut(self, hole: Sequence[Point]) -> None:
         """Cut a hole by its corners, counter-clockwise as seen from outside."""

@@ -21,8 +21,6 @@ def degrade_house(house: House, sigma: float, *, seed: int) -> House:
 
     Parameters
     ----------
-    house : House
-        The house.
     sigma : float
         Standard deviation of place, foot, length, width, height of the eaves and rise of the roof (m).
     seed : int

@@ -43,83 +43,42 @@ MOVED = 1e-9  # m; a roof that a node is closer to than this is exact
 
 @dataclass(frozen=True)
 class AdaptiveOptions:
-    """Parameters of the adaptive mesher.
+    """Parameters of the adaptive mesher."""
 
-    Attributes
-    ----------
-    mesh_size : float
-        Mesh size of the plane mesh (m).
-    domain_height : float
-        Height of the domain above the smoothed terrain, or above the highest terrain where its top is flat (m).
-    limits : SpacingLimits
-        Limits of the vertical spacing.
-    stagger : float
-        By how much neighbouring columns are shifted against each other: 0 for none, 1 for thirds of a step.
-    passes : int
-        Rounds of moving levels at the worst cells; one more where roofs slope, whose keys change by it.
-    growth : Growth or None
-        How the vertical spacing grows from the ground up to the limits; None: it is the same at all heights.
-    top : float or None
-        Absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain.
-    weld : Weld or None
-        How roofs that meet at a vertex are joined and parted; None: only roofs of one height are joined.
-    solids : bool
-        Whether columns go on below roofs, down to the terrain, for cells of buildings.
-    """
-
-    mesh_size: float
+    mesh_size: float  #: mesh size of the plane mesh (m)
+    #: height of the domain above the smoothed terrain, or above the highest terrain where its top is flat (m)
     domain_height: float
-    limits: SpacingLimits
+    limits: SpacingLimits  #: limits of the vertical spacing
+    #: by how much neighbouring columns are shifted against each other: 0 for none, 1 for thirds of a step
     stagger: float
-    passes: int
+    passes: int  #: rounds of moving levels at the worst cells; one more where roofs slope, whose keys change by it
+    #: how the vertical spacing grows from the ground up to the limits; None: it is the same at all heights
     growth: Growth | None = None
+    #: absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain
     top: float | None = None
+    #: how roofs that meet at a vertex are joined and parted; None: only roofs of one height are joined
     weld: Weld | None = None
-    solids: bool = False
+    solids: bool = False  #: whether columns go on below roofs, down to the terrain, for cells of buildings
 
 
 @dataclass(frozen=True)
 class AdaptiveReport:
-    """What the adaptive mesher did.
+    """What the adaptive mesher did."""
 
-    Attributes
-    ----------
-    n_columns, n_levels : int
-        Columns, and levels of all of them.
-    shared_columns : int
-        Columns that touch two roofs or more.
-    moved_nodes : int
-        Roofs that stand higher or lower in a column than they should: joined with others or parted from them.
-    largest_move : float
-        By how much at most (m).
-    eased_nodes : int
-        Roofs that were moved in a column for its cells, by `Weld.slack` at most.
-    joined_for_order : int
-        Roofs that were joined at one end of an edge, since they change order along it.
-    crossed_edges : int
-        Edges along which two roofs still change order, both ends being those of seams.
-    keyed_levels : int
-        Levels with an order key of their own.
-    passed_edges : int
-        Ends of tops of walls that the merge of columns still passes by.
-    improved_levels : int
-        Levels that the last passes moved.
-    worst_ratio : (float, float)
-        Smallest radius ratio before and after those passes.
-    """
-
+    #: columns, and levels of all of them
     n_columns: int
     n_levels: int
-    shared_columns: int
+    shared_columns: int  #: columns that touch two roofs or more
+    #: roofs that stand higher or lower in a column than they should: joined with others or parted from them
     moved_nodes: int
-    largest_move: float
-    eased_nodes: int
-    joined_for_order: int
-    crossed_edges: int
-    keyed_levels: int
-    passed_edges: int
-    improved_levels: int
-    worst_ratio: tuple[float, float]
+    largest_move: float  #: by how much at most (m)
+    eased_nodes: int  #: roofs that were moved in a column for its cells, by `Weld.slack` at most
+    joined_for_order: int  #: roofs that were joined at one end of an edge, since they change order along it
+    crossed_edges: int  #: edges along which two roofs still change order, both ends being those of seams
+    keyed_levels: int  #: levels with an order key of their own
+    passed_edges: int  #: ends of tops of walls that the merge of columns still passes by
+    improved_levels: int  #: levels that the last passes moved
+    worst_ratio: tuple[float, float]  #: smallest radius ratio before and after those passes
 
 
 def mesh_adaptive(
@@ -146,8 +105,6 @@ def mesh_adaptive(
         cells would be bad. All others are exact.
     ids : str, (b,)
         Building ids, for messages.
-    options : AdaptiveOptions
-        Parameters.
     seam : SeamColumns, optional
         Columns that are given by a seam: they stay bit for bit.
     sizes : SizeField, optional
@@ -276,8 +233,6 @@ def highest_roofs(plane: PlaneMesh, roofs: Roofs) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     roofs : Roofs
         Roof of each of its buildings.
     """

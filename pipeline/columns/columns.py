@@ -47,8 +47,6 @@ def merge_columns(mesh: ColumnMesh, part: slice, clockwise: NDArray[np.bool_], n
 
     Parameters
     ----------
-    mesh : ColumnMesh
-        The mesh.
     part : slice
         Triangles, one after the other.
     clockwise : bool, (m,)
@@ -97,32 +95,6 @@ def lowest_gap(mesh: ColumnMesh) -> tuple[float, int]:
     return float(gap.min()), int((gap <= 0).sum())
 
 
-def extract_boundary(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> Boundary:
-    """Extract the boundary of the volume with its markers (step 3.6).
-
-    Parameters
-    ----------
-    mesh : ColumnMesh
-        The mesh; its points are numbered as by `expand_cells`.
-    numbers : int64, (b,)
-        Number of each building of the city model.
-
-    Returns
-    -------
-    Boundary
-        Facets pointing out of the air: ground and roofs downwards. A wall belongs to the higher building;
-        there is none where both sides of an edge begin at the same levels.
-
-    Notes
-    -----
-    Walls are the facets over an edge that one of its two sides alone has. Where a roof is not level along
-    a wall, the merge may pass it by: then the higher side has facets that the lower lacks, and both are
-    written, each seen from its own air. The boundary is closed in any case.
-    """
-    low, high = mesh.plane.xy.min(axis=0), mesh.plane.xy.max(axis=0)
-    return _extract_boundary(mesh, numbers, (*low, *high), _no_seams())[0]
-
-
 def split_boundary(
     mesh: ColumnMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges, *, strict: bool = True
 ) -> tuple[Boundary, NDArray[np.int32]]:
@@ -130,8 +102,6 @@ def split_boundary(
 
     Parameters
     ----------
-    mesh : ColumnMesh
-        The tile's mesh.
     numbers : int64, (b,)
         Number of each building, row by row those of `PlaneMesh.building`.
     bounds : (xmin, ymin, xmax, ymax)
@@ -144,8 +114,9 @@ def split_boundary(
     Returns
     -------
     Boundary
-        As from `extract_boundary`, of this tile's air alone. Over a seam, these are the walls that only this
-        side has: the one beyond begins higher. If the tile beyond is missing, all facets are MISSING.
+        Facets pointing out of this tile's air: ground and roofs downwards. A wall belongs to the higher building;
+        there is none where both sides of an edge begin at the same levels. Over a seam, these are the walls that
+        only this side has: the one beyond begins higher. If the tile beyond is missing, all facets are MISSING.
     int32, (s, 3)
         The other facets over seams, pointing out of this tile's air. The tile beyond has each of them, bit for
         bit, in the opposite orientation.
@@ -158,25 +129,12 @@ def split_boundary(
 
     Notes
     -----
-    A wall on a seam is found like any other: from the levels at which the two sides begin. Both tiles have the
-    same columns there, so what one leaves out the other does not have.
+    Walls are the facets over an edge that one of its two sides alone has. Where a roof is not level along a wall,
+    the merge may pass it by: then the higher side has facets that the lower lacks, and both are written, each seen
+    from its own air. The boundary is closed in any case. A wall on a seam is found like any other: from the levels
+    at which the two sides begin. Both tiles have the same columns there, so what one leaves out the other does not
+    have.
     """
-    return _extract_boundary(mesh, numbers, bounds, seams, strict=strict)
-
-
-def _oriented(facets: NDArray[np.int32], swap: NDArray[np.bool_]) -> NDArray[np.int32]:
-    facets[swap] = facets[swap][:, [0, 2, 1]]
-    return facets
-
-
-def _no_seams() -> SeamEdges:
-    pairs = np.empty((0, 2), np.int32)
-    return SeamEdges(pairs, pairs, np.empty(0, np.int64), np.empty(0, np.bool_))
-
-
-def _extract_boundary(
-    mesh: ColumnMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges, *, strict: bool = False
-) -> tuple[Boundary, NDArray[np.int32]]:
     plane = mesh.plane
     first = mesh.z_start[plane.triangles]
     last = mesh.z_start[plane.triangles + 1] - 1
@@ -192,6 +150,11 @@ def _extract_boundary(
         np.concatenate((building, np.full(len(ceiling), -1), upright.building)),
     )
     return boundary, shared
+
+
+def _oriented(facets: NDArray[np.int32], swap: NDArray[np.bool_]) -> NDArray[np.int32]:
+    facets[swap] = facets[swap][:, [0, 2, 1]]
+    return facets
 
 
 def _upright_facets(

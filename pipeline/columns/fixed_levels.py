@@ -21,24 +21,14 @@ from pipeline.data.mesh import PlaneMesh
 
 @dataclass(frozen=True, eq=False)
 class GivenLevels:
-    """What step 3.5 keeps of ``n`` columns of ``l`` levels.
+    """What step 3.5 keeps of ``n`` columns of ``l`` levels."""
 
-    Attributes
-    ----------
-    kept : int32, (n,)
-        First level of each column that a cell uses; in a seam's column, one on either side.
-    kind : int8, (n, l)
-        What a level is, as in `Levels`, without the top; `FREE` for most.
-    stays : bool, (n, l)
-        Levels whose height is given: those that stand for something, and all of a seam's.
-    z : float64, (n, l)
-        Their heights (m); elsewhere NaN.
-    """
-
+    #: (n,): first level of each column that a cell uses; in a seam's column, one on either side
     kept: NDArray[np.int32]
-    kind: NDArray[np.int8]
+    kind: NDArray[np.int8]  #: (n, l): what a level is, as in `Levels`, without the top; `FREE` for most
+    #: (n, l): levels whose height is given: those that stand for something, and all of a seam's
     stays: NDArray[np.bool_]
-    z: NDArray[np.float64]
+    z: NDArray[np.float64]  #: (n, l): their heights (m); elsewhere NaN
 
 
 def find_given_levels(
@@ -55,8 +45,6 @@ def find_given_levels(
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     first : int32, (m,)
         First level of the cells over each triangle.
     ground : float64, (n,)
@@ -107,12 +95,8 @@ def take_used_levels(
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     first : int32, (m,)
         First level of the cells over each triangle.
-    given : GivenLevels
-        What was given.
     z : float64, (n, l)
         Heights of all levels (m).
     """
@@ -132,8 +116,6 @@ def stand_on_floors(
 
     Parameters
     ----------
-    given : GivenLevels
-        What was given.
     z : float64, (n, l)
         Heights of all levels (m): the lowest at the terrain, those from `GivenLevels.kept` on as they stay.
     heights : float64, (l,)

@@ -21,21 +21,14 @@ ABOVE_FIRST = 1.5  # first layers
 class Growth:
     """How vertical spacing grows from the ground.
 
-    Attributes
-    ----------
-    first : float
-        Height M of the first layer above open ground (m), above 0.
-    ratio : float
-        Ratio G of a layer's height to that of the layer below it, at least 1.
-
     Raises
     ------
     ValueError
         If one of them is out of bounds.
     """
 
-    first: float
-    ratio: float
+    first: float  #: height M of the first layer above open ground (m), above 0
+    ratio: float  #: ratio G of a layer's height to that of the layer below it, at least 1
 
     def __post_init__(self) -> None:
         if not (0 < self.first < np.inf and 1 <= self.ratio < np.inf):

@@ -39,65 +39,33 @@ Smoother = Literal["columns", "fem"]
 
 @dataclass(frozen=True)
 class LayeredOptions:
-    """Parameters of the layered mesher.
+    """Parameters of the layered mesher."""
 
-    Attributes
-    ----------
-    mesh_size : float
-        Mesh size of the plane mesh (m).
-    layer_height : float
-        Height of a layer (m); the domain is cut into the closest whole number of layers.
-    domain_height : float
-        Height of the domain above the terrain (m).
-    smoother : "columns" or "fem"
-        The fast path, or linear finite elements with multigrid.
-    tolerance : float
-        Residual over the diagonal (m) at which the fast path's step 3.5 stops.
-    fem_tolerance : float
-        Relative residual at which the finite elements stop.
-    growth : Growth or None
-        How layers grow from the ground up to `layer_height`; None: all have the same height.
-    top : float or None
-        Absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain.
-    solids : bool
-        Whether columns go on below roofs, down to the terrain, for cells of buildings.
-    """
-
-    mesh_size: float
-    layer_height: float
-    domain_height: float
-    smoother: Smoother
-    tolerance: float
-    fem_tolerance: float
+    mesh_size: float  #: mesh size of the plane mesh (m)
+    layer_height: float  #: height of a layer (m); the domain is cut into the closest whole number of layers
+    domain_height: float  #: height of the domain above the terrain (m)
+    smoother: Smoother  #: the fast path, or linear finite elements with multigrid
+    tolerance: float  #: residual over the diagonal (m) at which the fast path's step 3.5 stops
+    fem_tolerance: float  #: relative residual at which the finite elements stop
+    #: how layers grow from the ground up to `layer_height`; None: all have the same height
     growth: Growth | None = None
+    #: absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain
     top: float | None = None
-    solids: bool = False
+    solids: bool = False  #: whether columns go on below roofs, down to the terrain, for cells of buildings
 
 
 @dataclass(frozen=True)
 class LayeredReport:
-    """What the layered mesher did.
+    """What the layered mesher did."""
 
-    Attributes
-    ----------
-    n_layers : int
-        Layers of the slab.
-    parted_groups : int
-        Groups of equal roofs whose layer is not the closest, because of the roofs that they touch.
-    repaired_terrain, repaired_roofs : int
-        Levels that the repair moved after step 3.3 and after step 3.5.
-    iterations : int
-        Iterations of step 3.5's solver (with finite elements: of both steps).
-    residual : float
-        Its residual: over the diagonal (m), or relative with finite elements.
-    """
-
-    n_layers: int
+    n_layers: int  #: layers of the slab
+    #: groups of equal roofs whose layer is not the closest, because of the roofs that they touch
     parted_groups: int
+    #: levels that the repair moved after step 3.3 and after step 3.5
     repaired_terrain: int
     repaired_roofs: int
-    iterations: int
-    residual: float
+    iterations: int  #: iterations of step 3.5's solver (with finite elements: of both steps)
+    residual: float  #: its residual: over the diagonal (m), or relative with finite elements
 
 
 def count_layers(options: LayeredOptions) -> int:
@@ -152,8 +120,6 @@ def choose_layers(
         Terrain, as far beyond the walls as `terrain_reach` says; it may be NaN at nodes of tiles that are absent.
     bounds : (xmin, ymin, xmax, ymax)
         The region (m).
-    options : LayeredOptions
-        Parameters.
 
     Returns
     -------
@@ -213,8 +179,6 @@ def layer_mesh(
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     z : float64, (n, l)
         Heights of all levels (m).
     first : int32, (m,)
@@ -246,8 +210,6 @@ def mesh_layers(
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     dtm : Dtm
         Terrain, as far beyond the plane mesh as `terrain_reach` says.
     city : Prisms
@@ -256,8 +218,6 @@ def mesh_layers(
         Highest terrain at the walls of each building (m); of no use if `removed` is given.
     bounds : (xmin, ymin, xmax, ymax)
         The region (m).
-    options : LayeredOptions
-        Parameters.
     group : int32, (b,), optional
         Buildings of one group have the same roof height; by default each is a group of its own. Of no use if
         `removed` is given.

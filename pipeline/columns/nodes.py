@@ -23,106 +23,55 @@ ORDER_ROUNDS = 20  # of joining two roofs at one end of an edge, where they chan
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The surfaces that each of ``n`` columns touches, and at which level.
+    """The surfaces that each of ``n`` columns touches, and at which level."""
 
-    Attributes
-    ----------
-    start : int64, (n + 1,)
-        Column ``i`` has the surfaces ``start[i]`` to ``start[i + 1]``.
-    building : int64, (start[-1],)
-        Row of the building whose roof it is, `ON_GROUND` for the ground; ascending in every column.
-    level : int32, (start[-1],)
-        Level of the column, counted from below.
-    """
-
-    start: NDArray[np.int64]
+    start: NDArray[np.int64]  #: (n + 1,): column ``i`` has the surfaces ``start[i]`` to ``start[i + 1]``
+    #: (start[-1],): row of the building whose roof it is, `ON_GROUND` for the ground; ascending in every column
     building: NDArray[np.int64]
-    level: NDArray[np.int32]
+    level: NDArray[np.int32]  #: (start[-1],): level of the column, counted from below
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels of ``n`` columns.
+    """Levels of ``n`` columns."""
 
-    Attributes
-    ----------
-    start : int64, (n + 1,)
-        Column ``i`` has the levels ``start[i]`` to ``start[i + 1]``.
-    z : float64, (start[-1],)
-        Heights (m), ascending in every column.
-    kind : int8, (start[-1],)
-        `GROUND_LEVEL`, `ROOF_LEVEL`, `TOP_LEVEL`, or `FREE`: a level that may move.
-    key : float64, (start[-1],)
-        What columns are merged by (`ColumnMesh.key`); for most levels their heights.
-    surfaces : Surfaces
-        Which levels stand for which ground or roof.
-    """
-
-    start: NDArray[np.int64]
-    z: NDArray[np.float64]
+    start: NDArray[np.int64]  #: (n + 1,): column ``i`` has the levels ``start[i]`` to ``start[i + 1]``
+    z: NDArray[np.float64]  #: (start[-1],): heights (m), ascending in every column
+    #: (start[-1],): `GROUND_LEVEL`, `ROOF_LEVEL`, `TOP_LEVEL`, or `FREE`: a level that may move
     kind: NDArray[np.int8]
+    #: (start[-1],): what columns are merged by (`ColumnMesh.key`); for most levels their heights
     key: NDArray[np.float64]
-    surfaces: Surfaces
+    surfaces: Surfaces  #: which levels stand for which ground or roof
 
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The given heights of ``n`` columns, without their tops.
+    """The given heights of ``n`` columns, without their tops."""
 
-    Attributes
-    ----------
-    start : int64, (n + 1,)
-        Column ``i`` has the nodes ``start[i]`` to ``start[i + 1]``.
-    z : float64, (start[-1],)
-        Where each stands (m); ascending in every column.
-    kind : int8, (start[-1],)
-        `GROUND_LEVEL` or `ROOF_LEVEL`.
-    level : int32, (start[-1],)
-        Its level in a column that is given; -1 in others.
-    of_corner : int64, (m, 3)
-        The node where a triangle's cells begin at each corner.
-    """
-
-    start: NDArray[np.int64]
-    z: NDArray[np.float64]
-    kind: NDArray[np.int8]
-    level: NDArray[np.int32]
-    of_corner: NDArray[np.int64]
+    start: NDArray[np.int64]  #: (n + 1,): column ``i`` has the nodes ``start[i]`` to ``start[i + 1]``
+    z: NDArray[np.float64]  #: (start[-1],): where each stands (m); ascending in every column
+    kind: NDArray[np.int8]  #: (start[-1],): `GROUND_LEVEL` or `ROOF_LEVEL`
+    level: NDArray[np.int32]  #: (start[-1],): its level in a column that is given; -1 in others
+    of_corner: NDArray[np.int64]  #: (m, 3): the node where a triangle's cells begin at each corner
 
 
 @dataclass(frozen=True, eq=False)
 class NodeMoves:
-    """How nodes differ from the surfaces that they are for.
+    """How nodes differ from the surfaces that they are for."""
 
-    Attributes
-    ----------
-    distance : float64, (k,)
-        How far the node of each surface of each column stands above that surface (m); 0 for most.
-    joined_for_order : int
-        Pairs of roofs that were joined at one end of an edge, since they change order along it.
-    crossed : int
-        Edges along which two roofs still change order, both ends being given.
-    """
-
+    #: (k,): how far the node of each surface of each column stands above that surface (m); 0 for most
     distance: NDArray[np.float64]
+    #: pairs of roofs that were joined at one end of an edge, since they change order along it
     joined_for_order: int
-    crossed: int
+    crossed: int  #: edges along which two roofs still change order, both ends being given
 
 
 @dataclass(frozen=True, eq=False)
 class SeamColumns:
-    """Columns that a tile takes over as they are.
+    """Columns that a tile takes over as they are."""
 
-    Attributes
-    ----------
-    vertex : int32, (k,)
-        Vertices of the tile's plane mesh, each once.
-    levels : Levels
-        Their ``k`` columns, with a level for each surface that any tile has there.
-    """
-
-    vertex: NDArray[np.int32]
-    levels: Levels
+    vertex: NDArray[np.int32]  #: (k,): vertices of the tile's plane mesh, each once
+    levels: Levels  #: their ``k`` columns, with a level for each surface that any tile has there
 
 
 def no_seam() -> SeamColumns:
@@ -141,8 +90,6 @@ def collect_surfaces(plane: PlaneMesh, bottom: NDArray[np.int32]) -> Surfaces:
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     bottom : int32, (m, 3)
         Level where a triangle's cells begin at each corner.
     """
@@ -157,8 +104,6 @@ def find_surface_levels(levels: Levels, row: NDArray[np.int64], building: NDArra
 
     Parameters
     ----------
-    levels : Levels
-        Columns.
     row : int64, (k,)
         The columns that are asked.
     building : int64, (k,)
@@ -225,8 +170,6 @@ def place_nodes(
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     roofs : Roofs
         Roof of each building.
     ground : float64, (n,)

@@ -28,8 +28,6 @@ def wall_gates(mesh: ColumnMesh, *, floors: bool = False) -> NDArray[np.int64]:
 
     Parameters
     ----------
-    mesh : ColumnMesh
-        The mesh.
     floors : bool
         Whether buildings have cells, which begin at the lowest level of each column: then those of the higher one
         must make the same faces as those of a lower one beside it, up to the lower roof.

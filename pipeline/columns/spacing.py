@@ -21,18 +21,10 @@ TOP_REACH = 0.5  # of the domain's height: how far those averages look together
 
 @dataclass(frozen=True)
 class SpacingLimits:
-    """Limits of the vertical spacing, in target sizes of the place.
+    """Limits of the vertical spacing, in target sizes of the place."""
 
-    Attributes
-    ----------
-    least : float
-        Lower limit; also the least distance of two given heights of one column.
-    most : float
-        Upper limit. Flat layers of equilateral triangles are best at 0.8 of their edge.
-    """
-
-    least: float
-    most: float
+    least: float  #: lower limit; also the least distance of two given heights of one column
+    most: float  #: upper limit. Flat layers of equilateral triangles are best at 0.8 of their edge
 
 
 def mean_edges(plane: PlaneMesh) -> NDArray[np.float64]:
@@ -87,8 +79,6 @@ def column_spacing(
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
     sizes : SizeField or None
         Its target edge lengths, where they are not the same everywhere.
     limits : SpacingLimits

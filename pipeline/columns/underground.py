@@ -33,43 +33,24 @@ from pipeline.plane_mesh.sizes import SizeField
 
 @dataclass(frozen=True)
 class SoilOptions:
-    """Parameters of the soil.
+    """Parameters of the soil."""
 
-    Attributes
-    ----------
-    depth : float
-        Depth of the domain's bottom below the terrain (m).
-    mesh_size : float
-        Mesh size of the plane mesh (m).
-    limits : SpacingLimits
-        Limits of the vertical spacing: also the least distance of the soil from a roof above it.
-    stagger : float
-        By how much neighbouring columns are shifted against each other: 0 for none, 1 for thirds of a step.
-    """
-
-    depth: float
-    mesh_size: float
+    depth: float  #: depth of the domain's bottom below the terrain (m)
+    mesh_size: float  #: mesh size of the plane mesh (m)
+    #: limits of the vertical spacing: also the least distance of the soil from a roof above it
     limits: SpacingLimits
+    #: by how much neighbouring columns are shifted against each other: 0 for none, 1 for thirds of a step
     stagger: float
 
 
 @dataclass(frozen=True, eq=False)
 class RegionMesh:
-    """Columns of air with soil below them, or buildings, or both.
+    """Columns of air with soil below them, or buildings, or both."""
 
-    Attributes
-    ----------
-    columns : ColumnMesh
-        The air's mesh; its columns begin at the soil's bottom, and `ColumnMesh.bottom` counts from there.
-    top : int32, (n,)
-        Level of each column in which its soil ends: 0 without soil.
-    solids : bool
-        Whether buildings have cells.
-    """
-
+    #: the air's mesh; its columns begin at the soil's bottom, and `ColumnMesh.bottom` counts from there
     columns: ColumnMesh
-    top: NDArray[np.int32]
-    solids: bool = False
+    top: NDArray[np.int32]  #: (n,): level of each column in which its soil ends: 0 without soil
+    solids: bool = False  #: whether buildings have cells
 
     @property
     def has_soil(self) -> bool:
@@ -93,8 +74,6 @@ def soil_tops(
         Whether that is the ground.
     terrain : float64, (n,)
         Terrain (m).
-    options : SoilOptions
-        Parameters.
 
     Returns
     -------
@@ -126,8 +105,6 @@ def fill_soil(
         Vertices whose columns are wanted.
     top : float64, (k,)
         Where the soil ends in each (m).
-    options : SoilOptions
-        Parameters.
     sizes : SizeField, optional
         Sizes in the plane, where they are graded.
 
@@ -210,8 +187,6 @@ def add_soil(
         Terrain at each vertex (m).
     air, soil : SeamColumns
         Columns that are given by seams, of the same vertices: they stay bit for bit.
-    options : SoilOptions
-        Parameters.
     sizes : SizeField, optional
         Sizes in the plane, where they are graded.
     solids : bool
@@ -266,11 +241,6 @@ def count_regions(mesh: RegionMesh) -> dict[Region, int]:
 def expand_regions(mesh: RegionMesh) -> tuple[CellBlocks, NDArray[np.int8]]:
     """Tell the tetrahedra of positive volume that air, soil and buildings stand for.
 
-    Parameters
-    ----------
-    mesh : RegionMesh
-        The tile's mesh.
-
     Returns
     -------
     CellBlocks
@@ -305,8 +275,6 @@ def split_regions(
 
     Parameters
     ----------
-    mesh : RegionMesh
-        The tile's mesh.
     numbers, bounds, seams
         As in `split_boundary`; levels are those of `RegionMesh.columns`.
 

@@ -24,46 +24,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LevelOptions:
-    """When a house is divided.
+    """When a house is divided."""
 
-    Attributes
-    ----------
-    clearance : float
-        A new wall passes through a vertex or keeps this distance from it (m).
-    min_step : float
-        Least step of the roof at every new wall (m).
-    min_area : float
-        Least area of a part (m²).
-    min_points : int
-        Least number of roof points of a part.
-    min_explained : float
-        Least share of the squares around the mean height of a house that its division takes away.
-    max_depth : int
-        How often a piece is cut in two: 1 for one cut through a house, 0 for none.
-    """
-
-    clearance: float
-    min_step: float = 2.5
-    min_area: float = 15.0
-    min_points: int = 10
+    clearance: float  #: a new wall passes through a vertex or keeps this distance from it (m)
+    min_step: float = 2.5  #: least step of the roof at every new wall (m)
+    min_area: float = 15.0  #: least area of a part (m²)
+    min_points: int = 10  #: least number of roof points of a part
+    #: least share of the squares around the mean height of a house that its division takes away
     min_explained: float = 0.35
-    max_depth: int = 8
+    max_depth: int = 8  #: how often a piece is cut in two: 1 for one cut through a house, 0 for none
 
 
 @dataclass(frozen=True, eq=False)
 class HouseParts:
-    """Houses, some of them divided.
+    """Houses, some of them divided."""
 
-    Attributes
-    ----------
-    polygons : object, (p,)
-        shapely Polygons (m): the parts of each house one after the other, or the house itself.
-    house : int64, (p,)
-        Row of the house that the part belongs to, ascending.
-    """
-
+    #: (p,): shapely Polygons (m): the parts of each house one after the other, or the house itself
     polygons: NDArray[np.object_]
-    house: NDArray[np.int64]
+    house: NDArray[np.int64]  #: (p,): row of the house that the part belongs to, ascending
 
 
 def split_levels(polygons: NDArray[np.object_], points: RoofPoints, options: LevelOptions) -> HouseParts:
@@ -75,8 +53,6 @@ def split_levels(polygons: NDArray[np.object_], points: RoofPoints, options: Lev
         Valid shapely Polygons (m), courtyards as holes.
     points : RoofPoints
         Their roof points, as from `locate_roof_points`.
-    options : LevelOptions
-        Thresholds.
 
     Returns
     -------

@@ -58,62 +58,29 @@ _Division = tuple[Array, Array, Array, NDArray[np.int64], NDArray[np.int64], NDA
 
 @dataclass(frozen=True)
 class RoofOptions:
-    """How roofs are fitted to points.
+    """How roofs are fitted to points."""
 
-    Attributes
-    ----------
-    clearance : float
-        A new wall passes through a vertex or keeps 1.5 times this distance from it (m).
-    min_area : float
-        Least area of a part (m²).
-    min_points : int
-        Least number of roof points of a part.
-    min_density : float
-        Least number of roof points of a house for each m²; with fewer it has one height.
-    max_slope : float
-        Greatest slope of a roof.
-    cut_price : float
-        What a new wall must save: area (m²) of roof that is half a metre off its points.
-    min_step, min_kink : float
-        A wall stays where the roof steps by this (m), or its slopes differ by so much.
-    max_depth : int
-        How often a piece is cut in two.
-    """
-
-    clearance: float
-    min_area: float = 4.0
-    min_points: int = 8
-    min_density: float = 0.5
-    max_slope: float = 1.7
-    cut_price: float = 4.0
+    clearance: float  #: a new wall passes through a vertex or keeps 1.5 times this distance from it (m)
+    min_area: float = 4.0  #: least area of a part (m²)
+    min_points: int = 8  #: least number of roof points of a part
+    min_density: float = 0.5  #: least number of roof points of a house for each m²; with fewer it has one height
+    max_slope: float = 1.7  #: greatest slope of a roof
+    cut_price: float = 4.0  #: what a new wall must save: area (m²) of roof that is half a metre off its points
+    #: a wall stays where the roof steps by this (m), or its slopes differ by so much
     min_step: float = 0.3
     min_kink: float = 0.18
-    max_depth: int = 9
+    max_depth: int = 9  #: how often a piece is cut in two
 
 
 @dataclass(frozen=True, eq=False)
 class HouseRoofs:
-    """Roofs of ``h`` houses.
+    """Roofs of ``h`` houses."""
 
-    Attributes
-    ----------
-    parts : HouseParts
-        Their ``p`` parts.
-    roofs : Roofs
-        The roof of each part; NaN for a house without points.
-    method : int8, (h,)
-        Where the roof of each house comes from: index into `ROOF_METHODS`.
-    n_planes : int32, (h,)
-        Number of different planes of each house.
-    too_few : bool, (h,)
-        Houses with too few points for planes: one flat part.
-    """
-
-    parts: HouseParts
-    roofs: Roofs
-    method: NDArray[np.int8]
-    n_planes: NDArray[np.int32]
-    too_few: NDArray[np.bool_]
+    parts: HouseParts  #: their ``p`` parts
+    roofs: Roofs  #: the roof of each part; NaN for a house without points
+    method: NDArray[np.int8]  #: (h,): where the roof of each house comes from: index into `ROOF_METHODS`
+    n_planes: NDArray[np.int32]  #: (h,): number of different planes of each house
+    too_few: NDArray[np.bool_]  #: (h,): houses with too few points for planes: one flat part
 
 
 def fit_roofs(
@@ -130,8 +97,6 @@ def fit_roofs(
         Valid shapely Polygons (m), courtyards as holes.
     points : RoofPoints
         Their roof points, as from `locate_roof_points`.
-    options : RoofOptions
-        Thresholds.
     finer : (float, float), optional
         Clearance and price of cuts of a second division by the same planes.
 
@@ -189,8 +154,6 @@ def replace_roofs(fitted: HouseRoofs, new: Mapping[int, NewRoof]) -> HouseRoofs:
 
     Parameters
     ----------
-    fitted : HouseRoofs
-        Roofs of all houses.
     new : mapping of int to NewRoof
         By the row of the house.
     """

@@ -19,18 +19,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """The line of the places whose product with ``normal`` is ``offset``.
+    """The line of the places whose product with ``normal`` is ``offset``."""
 
-    Attributes
-    ----------
-    along : float64, (2,)
-        Unit vector along the line.
-    offset : float
-        Distance from the origin (m).
-    """
-
-    along: Array
-    offset: float
+    along: Array  #: (2,): unit vector along the line
+    offset: float  #: distance from the origin (m)
 
     @property
     def normal(self) -> Array:
@@ -177,20 +169,8 @@ def _best_lines(
 ) -> tuple[Array, Array]:
     """Find the best line through a vertex, and the best between two points and clear of all vertices.
 
-    Parameters
-    ----------
-    across, z : float64, (n,)
-        Places of the points across the line, and their heights from the mean (m).
-    vertex : float64, (m,)
-        Places of the vertices across the line, ascending (m).
-    total : float
-        Sum of the squares of `z` (m²).
-
-    Returns
-    -------
-    gain, offset : float64, (2,)
-        Share of `total` that the line takes away, 0 with too few points on a side, and its place across (m); -1
-        where there is no such line.
+    Gives the share of the squares `total` of the heights `z` that each takes away, 0 with too few points on a side
+    and -1 where there is no such line, and its place across.
     """
     n = len(across)
     points = np.empty((n, 3))  # in order across the line, and as they come where they are on one line

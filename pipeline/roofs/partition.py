@@ -29,29 +29,17 @@ Index = NDArray[np.int64]
 
 
 class PartRules(NamedTuple):
-    """When a piece is cut, and when parts are joined.
+    """When a piece is cut, and when parts are joined."""
 
-    Attributes
-    ----------
-    clearance : float
-        Distance of new walls from others (m).
-    min_area, min_points : float
-        What a part has at least (m², points).
-    price : float
-        Misfit that a wall must save.
-    min_step, min_kink : float
-        A wall stays where the roof steps by this (m), or its slopes differ by so much.
-    max_depth : float
-        How often a piece is cut.
-    """
-
-    clearance: float
+    clearance: float  #: distance of new walls from others (m)
+    #: what a part has at least (m², points)
     min_area: float
     min_points: float
-    price: float
+    price: float  #: misfit that a wall must save
+    #: a wall stays where the roof steps by this (m), or its slopes differ by so much
     min_step: float
     min_kink: float
-    max_depth: float
+    max_depth: float  #: how often a piece is cut
 
 
 @kernel
@@ -74,8 +62,6 @@ def cut_house(
         Along which lines to cut: as for `rank_cuts`.
     net
         As from `open_subdivision`.
-    rules : PartRules
-        Thresholds.
 
     Returns
     -------

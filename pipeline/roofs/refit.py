@@ -33,8 +33,6 @@ def refit_roofs(roofs: Roofs, polygons: NDArray[np.object_], points: RoofPoints,
         Roofs of the faces, from the parts that they were made of.
     polygons : object, (n,)
         The faces.
-    points : RoofPoints
-        Their roof points.
     max_slope : float
         Greatest slope of a roof.
 

@@ -67,23 +67,9 @@ def join_cells(
 
 @kernel
 def _find_borders(start: Index, xy: Array, ring: Index, xyz: Array, first: Index) -> tuple[Index, Array, Index]:
-    """Find the edges that two cells share, and the heights of the points beside them.
+    """Find the edges that two cells share (b, 2), and the heights of the points beside them.
 
-    Parameters
-    ----------
-    start, xy, ring
-        Vertices of all cells, as in `pipeline.geometry.inside.Rings`.
-    xyz : float64, (n, 3)
-        Points (m); cell ``c`` has those from ``first[c]`` to ``first[c + 1]``.
-
-    Returns
-    -------
-    border : int64, (b, 2)
-        Cells of each such edge.
-    near : float64, (k,)
-        Heights of the points beside them (m).
-    near_start : int64, (2 b + 1,)
-        Those on side ``s`` of border ``k`` begin at ``near_start[2 * k + s]``.
+    Heights on side ``s`` of border ``k`` begin at ``near_start[2 * k + s]``.
     """
     edges = _number_edges(start, xy, ring)
     border, at = np.empty((len(edges) // 2, 2), np.int64), np.empty(len(edges) // 2, np.int64)
@@ -152,21 +138,7 @@ def _join(
     min_points: int,
     min_near: int,
 ) -> tuple[Index, float]:
-    """Join cells as `join_cells` does; gives its results.
-
-    Parameters
-    ----------
-    border, near, near_start
-        As from `_find_borders`.
-    area : float64, (c,)
-        Areas of the cells (m²).
-    z : float64, (n,)
-        Heights of all points, ascending (m).
-    cell : int64, (n,)
-        Cell of each.
-    min_step, min_area, min_points, min_near
-        As for `join_cells`, and `MIN_NEAR`.
-    """
+    """Join cells as `join_cells` does; heights of all points, with the cell of each, ascend."""
     region, area = np.arange(len(area)), area.copy()
     count, height = np.empty(len(area), np.int64), np.empty(len(area))
     for c in range(len(area)):

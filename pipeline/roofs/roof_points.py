@@ -13,21 +13,11 @@ from pipeline.geometry.inside import find_inside
 
 @dataclass(frozen=True, eq=False)
 class RoofPoints:
-    """Roof points of ``n`` buildings.
+    """Roof points of ``n`` buildings."""
 
-    Attributes
-    ----------
-    start : int64, (n + 1,)
-        Building ``i`` has the points ``xyz[start[i]:start[i + 1]]``.
-    xyz : float64, (k, 3)
-        Coordinates (m), in any order within each building.
-    z : float64, (k,)
-        Heights (m), ascending within each building: not in the order of `xyz`.
-    """
-
-    start: NDArray[np.int64]
-    xyz: NDArray[np.float64]
-    z: NDArray[np.float64]
+    start: NDArray[np.int64]  #: (n + 1,): building ``i`` has the points ``xyz[start[i]:start[i + 1]]``
+    xyz: NDArray[np.float64]  #: (k, 3): coordinates (m), in any order within each building
+    z: NDArray[np.float64]  #: (k,): heights (m), ascending within each building: not in the order of `xyz`
 
 
 def make_roof_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> RoofPoints:

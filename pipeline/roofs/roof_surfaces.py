@@ -28,21 +28,13 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RoofSurfaces:
-    """Roof surfaces that are known of houses.
+    """Roof surfaces that are known of houses."""
 
-    Attributes
-    ----------
-    start : int64, (h + 1,)
-        The surfaces of house k are ``start[k]`` to ``start[k + 1]``: none where nothing is known.
-    polygons : object, (s,)
-        Where they lie in plan, valid polygons or multipolygons (m): they may overlap each other and the outline.
-    roofs : Roofs
-        Their planes.
-    """
-
+    #: (h + 1,): the surfaces of house k are ``start[k]`` to ``start[k + 1]``: none where nothing is known
     start: Index
+    #: (s,): where they lie in plan, valid polygons or multipolygons (m): may overlap each other and the outline
     polygons: NDArray[np.object_]
-    roofs: Roofs
+    roofs: Roofs  #: their planes
 
 
 def no_surfaces(n: int) -> RoofSurfaces:
@@ -52,20 +44,11 @@ def no_surfaces(n: int) -> RoofSurfaces:
 
 @dataclass(frozen=True, eq=False)
 class SurfacedRoof:
-    """The roof of one house.
+    """The roof of one house."""
 
-    Attributes
-    ----------
-    parts : object, (p,)
-        Polygons that cover the house without overlap and share their vertices (m).
-    roofs : Roofs
-        The plane of each.
-    overhang, gap : float
-        Area of surfaces beyond the house, and of the house without a surface (m²).
-    """
-
-    parts: NDArray[np.object_]
-    roofs: Roofs
+    parts: NDArray[np.object_]  #: (p,): polygons that cover the house without overlap and share their vertices (m)
+    roofs: Roofs  #: the plane of each
+    #: area of surfaces beyond the house, and of the house without a surface (m²)
     overhang: float
     gap: float
 
@@ -77,8 +60,6 @@ def square_gaps(polygons: NDArray[np.object_], roofs: Roofs, one: Index, other: 
     ----------
     polygons : object, (n,)
         Valid geometries (m); what has no area counts for nothing.
-    roofs : Roofs
-        Roofs.
     one, other : int64, (n,)
         Both roofs of each.
 

@@ -26,27 +26,17 @@ WIDEST_CUT = 140.0
 
 @dataclass(frozen=True, eq=False)
 class Spokes:
-    """The ends of all walls, around each vertex counter-clockwise.
+    """The ends of all walls, around each vertex counter-clockwise."""
 
-    Attributes
-    ----------
-    vertex, head, edge : int64, (2m,)
-        The vertex, the wall's other end, and the wall.
-    after, before : int64, (2m,)
-        The next and the last spoke around the vertex.
-    angle : float64, (2m,)
-        From this spoke to the next one (radians).
-    label : int64, (2m,)
-        Label of the face between this spoke and the next one.
-    """
-
+    #: (2m,): the vertex, the wall's other end, and the wall
     vertex: NDArray[np.int64]
     head: NDArray[np.int64]
     edge: NDArray[np.int64]
+    #: (2m,): the next and the last spoke around the vertex
     after: NDArray[np.int64]
     before: NDArray[np.int64]
-    angle: NDArray[np.float64]
-    label: NDArray[np.int64]
+    angle: NDArray[np.float64]  #: (2m,): from this spoke to the next one (radians)
+    label: NDArray[np.int64]  #: (2m,): label of the face between this spoke and the next one
 
 
 def find_touches(graph: WallGraph, faces: Faces, label: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -18,34 +18,18 @@ FARTHEST = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Fidelity:
-    """What a simplification did to the houses.
+    """What a simplification did to the houses."""
 
-    Attributes
-    ----------
-    house_error : float64, (n,)
-        Area of each house's symmetric difference with its original (m²); the whole area if it is lost.
-    area_error : float
-        Sum of `house_error` over the sum of the original areas; 0 without houses.
-    lost : tuple of int
-        Indices of the originals without a face.
-    min_clearance : float
-        Least distance of two vertices, or of a vertex and a foreign wall, among all walls (m), 0 if walls cross;
-        `FARTHEST` if that is less.
-    corner_touches : int
-        Vertices in which houses touch without a common wall.
-    n_walls : int
-        Walls, each counted once.
-    sharpest : float
-        Least angle between two walls (degrees), 180 without walls.
-    """
-
+    #: (n,): area of each house's symmetric difference with its original (m²); the whole area if it is lost
     house_error: NDArray[np.float64]
-    area_error: float
-    lost: tuple[int, ...]
+    area_error: float  #: sum of `house_error` over the sum of the original areas; 0 without houses
+    lost: tuple[int, ...]  #: indices of the originals without a face
+    #: least distance of two vertices, or of a vertex and a foreign wall, among all walls (m), 0 if walls cross;
+    #: `FARTHEST` if that is less
     min_clearance: float
-    corner_touches: int
-    n_walls: int
-    sharpest: float
+    corner_touches: int  #: vertices in which houses touch without a common wall
+    n_walls: int  #: walls, each counted once
+    sharpest: float  #: least angle between two walls (degrees), 180 without walls
 
 
 def measure_simplification(
@@ -64,9 +48,9 @@ def measure_simplification(
 
     Examples
     --------
-    >>> from pipeline.simplification.planar import simplify_planar
+    >>> from pipeline.simplification.planar import shape_planar
     >>> pair = np.array([shapely.box(0, 0, 4, 4), shapely.box(4.4, 0, 9, 4)])
-    >>> city = simplify_planar(pair, clearance=0.5, min_area=5.0, min_courtyard_area=5.0)
+    >>> city = shape_planar(pair, np.zeros(2, int), clearance=0.5, min_area=5.0, min_courtyard_area=5.0)
     >>> found = measure_simplification(pair, city.polygons, city.house)
     >>> found.house_error.round(3).tolist(), found.min_clearance, found.n_walls
     ([1.6, 0.0], 4.0, 7)

@@ -14,24 +14,14 @@ Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 @dataclass(frozen=True, eq=False)
 class WallGraph:
-    """Walls of many clusters of buildings as one graph; edges never join two clusters.
+    """Walls of many clusters of buildings as one graph; edges never join two clusters."""
 
-    Attributes
-    ----------
-    xy : float64, (n, 2)
-        Vertices in whole millimetres: differences and their products are exact up to 90 km.
-    cluster : int64, (n,)
-        The cluster of each vertex; vertices are unique and sorted by (cluster, x, y).
-    edges : int64, (m, 2)
-        Vertex indices, ascending in each row; rows are unique and sorted.
-    slack : float64, (m,)
-        How far an edge may already be from the walls that it stands for (mm).
-    """
-
+    #: (n, 2): vertices in whole millimetres: differences and their products are exact up to 90 km
     xy: NDArray[np.float64]
+    #: (n,): the cluster of each vertex; vertices are unique and sorted by (cluster, x, y)
     cluster: NDArray[np.int64]
-    edges: NDArray[np.int64]
-    slack: NDArray[np.float64]
+    edges: NDArray[np.int64]  #: (m, 2): vertex indices, ascending in each row; rows are unique and sorted
+    slack: NDArray[np.float64]  #: (m,): how far an edge may already be from the walls that it stands for (mm)
 
     def vectors(self) -> NDArray[np.float64]:
         """Give each edge's vector (mm)."""
@@ -60,20 +50,11 @@ class WallGraph:
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """The bounded faces of a `WallGraph`.
+    """The bounded faces of a `WallGraph`."""
 
-    Attributes
-    ----------
-    polygons : object, (f,)
-        Shell counter-clockwise, holes clockwise (mm).
-    cluster : int64, (f,)
-        Ascending.
-    sides : int64, (m, 2)
-        Face on the left and on the right of each edge, seen from its first vertex; -1 outside.
-    """
-
-    polygons: NDArray[np.object_]
-    cluster: NDArray[np.int64]
+    polygons: NDArray[np.object_]  #: (f,): shell counter-clockwise, holes clockwise (mm)
+    cluster: NDArray[np.int64]  #: (f,): ascending
+    #: (m, 2): face on the left and on the right of each edge, seen from its first vertex; -1 outside
     sides: NDArray[np.int64]
 
 
@@ -160,8 +141,6 @@ def thread_edges(
 
     Parameters
     ----------
-    graph : WallGraph
-        Graph.
     edge, vertex : int64, (k,)
         An edge, and a vertex that it shall lead through.
     moved : float64, (k,)
@@ -190,8 +169,6 @@ def find_close(graph: WallGraph, distance: float) -> tuple[Pairs, NDArray[np.flo
 
     Parameters
     ----------
-    graph : WallGraph
-        Graph.
     distance : float
         Bound (mm).
 
@@ -223,8 +200,6 @@ def find_near(graph: WallGraph, distance: float) -> tuple[Pairs, NDArray[np.floa
 
     Parameters
     ----------
-    graph : WallGraph
-        Graph.
     distance : float
         Bound (mm).
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from pipeline.city_model.city import CityOptions
 from pipeline.data.roofs import Roofs, take_roofs
-from pipeline.geometry.components import join_pairs
 from pipeline.roofs.house_levels import HouseParts
 from pipeline.simplification.graph import MILLIMETRES
 from pipeline.simplification.merge import merge_footprints
@@ -28,33 +27,16 @@ HELPS = 1.2  # closing an outline must add a fifth of its area: a wall without w
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """Buildings of some simplified clusters.
+    """Buildings of some simplified clusters."""
 
-    Attributes
-    ----------
-    polygons : object, (k,)
-        Valid shapely Polygons (m).
-    member_start : int64, (k + 1,)
-        Building ``i`` was made of the parts ``member[member_start[i]:member_start[i + 1]]``.
-    member : int64
-        Rows of parts, ascending in each building.
-    cluster : int64, (k,)
-        Cluster of each building.
-    closed : int64, (c, 2)
-        Row and cluster of each part that was simplified by its closed outline.
-    clearance : float64, (k,)
-        Least distance of walls in the cluster of each building (m).
-    counts : dict
-        What was done, by name.
-    """
-
-    polygons: NDArray[np.object_]
+    polygons: NDArray[np.object_]  #: (k,): valid shapely Polygons (m)
+    #: (k + 1,): building ``i`` was made of the parts ``member[member_start[i]:member_start[i + 1]]``
     member_start: NDArray[np.int64]
-    member: NDArray[np.int64]
-    cluster: NDArray[np.int64]
-    closed: NDArray[np.int64]
-    clearance: NDArray[np.float64]
-    counts: dict[str, int]
+    member: NDArray[np.int64]  #: rows of parts, ascending in each building
+    cluster: NDArray[np.int64]  #: (k,): cluster of each building
+    closed: NDArray[np.int64]  #: (c, 2): row and cluster of each part that was simplified by its closed outline
+    clearance: NDArray[np.float64]  #: (k,): least distance of walls in the cluster of each building (m)
+    counts: dict[str, int]  #: what was done, by name
 
     def __len__(self) -> int:
         return len(self.polygons)
@@ -67,8 +49,6 @@ def shape_clusters(
 
     Parameters
     ----------
-    parts : HouseParts
-        Parts of houses.
     cluster : int64, (h,)
         Cluster of each house; -1 for houses to leave out.
     options : CityOptions
@@ -81,38 +61,6 @@ def shape_clusters(
     if options.simplify == "paper":
         return _merge_clusters(parts.polygons, rows, of_part, options)
     return _shape_planar_clusters(parts, rows, of_part, options, roofs)
-
-
-def simplify_houses(
-    parts: HouseParts, outlines: NDArray[np.object_], options: CityOptions, roofs: Roofs | None = None
-) -> Shapes:
-    """Simplify all houses in rounds, in memory: what the tiles of a region do together.
-
-    Parameters
-    ----------
-    parts : HouseParts
-        Parts of the houses.
-    outlines : object, (h,)
-        Outlines of the houses (m).
-    options : CityOptions
-        Parameters.
-    roofs : Roofs, optional
-        As for `shape_clusters`.
-    """
-    cluster = join_pairs(len(outlines), find_close(outlines, options.clearance))
-    shapes, todo, counts = join_shapes([]), cluster, Counter[str]()
-    while True:
-        piece = shape_clusters(parts, todo, options, roofs)
-        add_counts(counts, piece.counts)
-        shapes = join_shapes([shapes, piece])
-        close = shapes.cluster[find_close(shapes.polygons, options.clearance)]
-        joined = join_pairs(len(cluster), close[close[:, 0] != close[:, 1]])[cluster]
-        touched = np.isin(joined, joined[joined != cluster])
-        counts["clusters joined"] += len(np.unique(cluster)) - len(np.unique(joined))
-        if not touched.any():
-            return replace(shapes, counts=dict(counts))
-        shapes = leave_out(shapes, np.unique(cluster[touched]))
-        cluster, todo = joined, np.where(touched, joined, -1)
 
 
 def find_close(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.int64]:
@@ -147,7 +95,7 @@ def join_shapes(several: Sequence[Shapes]) -> Shapes:
     nothing = np.empty(0, np.int64)
     counts = Counter[str]()
     for shapes in several:
-        add_counts(counts, shapes.counts)
+        counts.update(shapes.counts)
     size = np.concatenate([nothing, *(np.diff(shapes.member_start) for shapes in several)])
     return Shapes(
         np.concatenate([nothing.astype(object), *(shapes.polygons for shapes in several)]),
@@ -177,14 +125,6 @@ def keep_shapes(shapes: Shapes, stays: NDArray[np.bool_]) -> Shapes:
         cluster=shapes.cluster[stays],
         clearance=shapes.clearance[stays],
     )
-
-
-def add_counts(total: Counter[str], more: dict[str, int]) -> None:
-    """Add numbers by name; of rounds, the most count."""
-    rounds = max(total.get("rounds", 0), more.get("rounds", 0))
-    total.update(more)
-    if "rounds" in total:
-        total["rounds"] = rounds
 
 
 def close_outlines(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.object_]:

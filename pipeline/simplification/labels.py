@@ -16,21 +16,11 @@ BUILT_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Territories:
-    """Interior-disjoint pieces of the plane that belong to one house each.
+    """Interior-disjoint pieces of the plane that belong to one house each."""
 
-    Attributes
-    ----------
-    polygons : object, (t,)
-        shapely Polygons (mm).
-    house : int64, (t,)
-        House of each.
-    cluster : int64, (t,)
-        Cluster of each.
-    """
-
-    polygons: NDArray[np.object_]
-    house: NDArray[np.int64]
-    cluster: NDArray[np.int64]
+    polygons: NDArray[np.object_]  #: (t,): shapely Polygons (mm)
+    house: NDArray[np.int64]  #: (t,): house of each
+    cluster: NDArray[np.int64]  #: (t,): cluster of each
 
 
 def claim_ground(

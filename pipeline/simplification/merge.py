@@ -16,31 +16,24 @@ from pipeline.simplification.patches import merge_polygons
 
 # Size of a bin as a multiple of the mean footprint diameter: the paper's choice.
 BIN_FACTOR = 4.0
+MAX_ITERATIONS = 3  # patches that are tried for a pair
 METHODS = ("union", "patch", "hulls", "hull")
 RUNGS = ("repaired-simplify", "repaired-buffer", "repaired-hull")
 
 
 @dataclass(frozen=True, eq=False)
 class MergedFootprints:
-    """Footprints after step 2.1.
+    """Footprints after step 2.1."""
 
-    Attributes
-    ----------
-    polygons : object, (k,)
-        Valid shapely Polygons in canonical form and order, each at least the clearance from all others.
-    members : tuple of k int64 arrays
-        Indices of the input polygons that each was made of, ascending.
-    method : tuple of k str
-        How each got its last shape: ``"single"`` (as it came), ``"union"``, ``"patch"``, ``"hulls"``,
-        ``"hull"``, or the rung of `make_sound` that repaired it.
-    counts : dict of str to int
-        How many merges ended as each of `METHODS`, how many repairs on each of `RUNGS`, and
-        ``"hole-filled"``, the holes of the input that were too small. All keys are there, in this order.
-    """
-
+    #: (k,): valid shapely Polygons in canonical form and order, each at least the clearance from all others
     polygons: NDArray[np.object_]
+    #: k of them: indices of the input polygons that each was made of, ascending
     members: tuple[NDArray[np.int64], ...]
+    #: k of them: how each got its last shape: ``"single"`` (as it came), ``"union"``, ``"patch"``, ``"hulls"``,
+    #: ``"hull"``, or the rung of `make_sound` that repaired it
     method: tuple[str, ...]
+    #: how many merges ended as each of `METHODS`, how many repairs on each of `RUNGS`, and ``"hole-filled"``, the
+    #: holes of the input that were too small. All keys are there, in this order
     counts: dict[str, int]
 
 
@@ -48,7 +41,6 @@ def merge_footprints(
     polygons: NDArray[np.object_],
     *,
     clearance: float,
-    max_iterations: int = 3,
     min_hole_area: float,
     floor: float,
     tolerance: float,
@@ -62,8 +54,6 @@ def merge_footprints(
     clearance : float
         Polygons closer than this are merged; merged shapes are accepted if their own minimum clearance is not
         less (m).
-    max_iterations : int
-        Patches tried for a pair, the tolerance of the projections doubled each time.
     min_hole_area : float
         Smaller holes, and holes that no disc of diameter `clearance` fits into, are filled (m²).
     floor : float
@@ -82,7 +72,7 @@ def merge_footprints(
     GeometryError
         If an input polygon is invalid or empty, or a result breaks one of these promises.
     ValueError
-        Unless ``0 <= tolerance <= floor <= clearance``, ``0 < floor`` and ``max_iterations >= 0``.
+        Unless ``0 <= tolerance <= floor <= clearance`` and ``0 < floor``.
 
     Notes
     -----
@@ -100,12 +90,9 @@ def merge_footprints(
     >>> print(merged.polygons[0], merged.members[0], merged.method[0])
     POLYGON ((0 0, 9 0, 9 4, 0 4, 0 0)) [0 1] patch
     """
-    if not (0 <= tolerance <= floor <= clearance and floor > 0 and max_iterations >= 0):
-        raise ValueError(
-            f"want 0 <= tolerance {tolerance} <= floor {floor} <= clearance {clearance}, floor > 0, "
-            f"max_iterations {max_iterations} >= 0"
-        )
-    _check_input(polygons)
+    if not (0 <= tolerance <= floor <= clearance and floor > 0):
+        raise ValueError(f"want 0 <= tolerance {tolerance} <= floor {floor} <= clearance {clearance}, floor > 0")
+    check_footprints(polygons)
     canonical = make_canonical(polygons)
     order = sort_canonically(canonical)
     shapes, n_filled = fill_small_holes(canonical[order], min_hole_area=min_hole_area, clearance=clearance)
@@ -133,7 +120,7 @@ def merge_footprints(
                 shapes[i],
                 shapes[j],
                 clearance=clearance,
-                max_iterations=max_iterations,
+                max_iterations=MAX_ITERATIONS,
                 min_hole_area=min_hole_area,
                 tolerance=tolerance,
             )
@@ -190,7 +177,8 @@ def _drop_needless(shapes: NDArray[np.object_], tolerance: float) -> NDArray[np.
     return np.where(shapely.is_valid(lean), make_canonical(lean), shapes)
 
 
-def _check_input(polygons: NDArray[np.object_]) -> None:
+def check_footprints(polygons: NDArray[np.object_]) -> None:
+    """Raise GeometryError with the first polygon that is invalid or empty."""
     usable = (shapely.get_type_id(polygons) == shapely.GeometryType.POLYGON) & ~shapely.is_empty(polygons)
     usable &= shapely.is_valid(polygons)
     if not usable.all():

@@ -31,46 +31,25 @@ MAX_PASSES = 6
 
 @dataclass(frozen=True)
 class Rules:
-    """What `shape_clusters` has to keep.
+    """What `shape_clusters` has to keep."""
 
-    Attributes
-    ----------
-    clearance, chain_tolerance : float
-        Lengths (mm), see `pipeline.simplification.snap.settle`.
-    min_area, min_courtyard_area : float
-        Areas (mm²), see `pipeline.simplification.labels.drop_small_faces`.
-    manifold : bool
-        Whether corners in which houses only touch are opened or closed.
-    """
-
-    clearance: float
-    chain_tolerance: float
+    clearance: float  #: least distance (mm), see `pipeline.simplification.snap.settle`
+    #: areas (mm²), see `pipeline.simplification.labels.drop_small_faces`
     min_area: float
     min_courtyard_area: float
-    manifold: bool
+    manifold: bool  #: whether corners in which houses only touch are opened or closed
 
 
 @dataclass(frozen=True, eq=False)
 class Shaped:
-    """Clusters with clearance.
+    """Clusters with clearance."""
 
-    Attributes
-    ----------
-    polygons : object, (k,)
-        Faces that belong to houses (mm).
-    house, cluster : int64, (k,)
-        House and cluster of each.
-    touches : int64, (t,)
-        Cluster of each vertex in which houses only touch.
-    method : dict of int to str
-        The rung that each cluster ended on.
-    """
-
-    polygons: NDArray[np.object_]
+    polygons: NDArray[np.object_]  #: (k,): faces that belong to houses (mm)
+    #: (k,): house and cluster of each
     house: NDArray[np.int64]
     cluster: NDArray[np.int64]
-    touches: NDArray[np.int64]
-    method: dict[int, str]
+    touches: NDArray[np.int64]  #: (t,): cluster of each vertex in which houses only touch
+    method: dict[int, str]  #: the rung that each cluster ended on
 
     def leave_out(self, clusters: NDArray[np.int64]) -> "Shaped":
         """Forget some clusters."""
@@ -107,8 +86,6 @@ def shape_clusters(
         Valid shapely Polygons (mm), in an order that depends on them alone.
     cluster : int64, (n,)
         Their clusters, -1 for houses to leave out.
-    rules : Rules
-        What to keep.
     roofs : Roofs, optional
         Known roofs of the houses, as for `claim_ground`.
 
@@ -173,8 +150,8 @@ def _run_passes(
     outcomes = []
     restless = [np.zeros(0, np.int64)]
     for last in [False] * (MAX_PASSES - 1) + [True]:
-        graph, unsettled, done = settle(graph, clearance=rules.clearance, chain_tolerance=rules.chain_tolerance)
-        _add(counts, done)
+        graph, unsettled, done = settle(graph, rules.clearance)
+        add_counts(counts, done)
         restless.append(unsettled)
         graph = graph.keep(~np.isin(graph.edge_clusters(), unsettled))
         dressed = _dress(graph, territories, rules, counts)
@@ -184,7 +161,7 @@ def _run_passes(
             graph, cut, done = mend_corners(
                 graph, dressed.faces, dressed.label, clearance=rules.clearance, manifold=rules.manifold
             )
-            _add(counts, done)
+            add_counts(counts, done)
             changed = np.union1d(changed, cut)
         else:
             changed = changed[:0]
@@ -253,7 +230,7 @@ def _name(clusters: NDArray[np.int64], method: str) -> Shaped:
     return Shaped(np.zeros(0, object), nothing, nothing, nothing, names)
 
 
-def _add(counts: Counter[str], done: Counter[str]) -> None:
+def add_counts(counts: Counter[str], done: Counter[str]) -> None:
     """Add up what was done; of rounds, the most count."""
     rounds = max(counts["rounds"], done["rounds"])
     counts.update(done)

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.building_points import has_building_class, merge_building_points, take_building_points
+from pipeline.city_model.building_points import merge_building_points, take_building_points
 from pipeline.city_model.city import (
     City,
     CityOptions,
@@ -20,55 +20,22 @@ from pipeline.city_model.city import (
 )
 from pipeline.city_model.groups import adjacent_houses, group_roofs
 from pipeline.city_model.heights import Heights, highest_wall_ground, raise_low_roofs
-from pipeline.city_model.houses import Houses, divide_houses, find_fallbacks, find_model_roofs, name_parts
+from pipeline.city_model.houses import Houses, find_fallbacks, name_parts
 from pipeline.city_model.model_roofs import MODEL
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
-from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import Roofs, choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.roofs.house_roofs import RoofOptions
 from pipeline.roofs.refit import refit_roofs
-from pipeline.roofs.roof_points import RoofPoints, locate_roof_points
+from pipeline.roofs.roof_points import RoofPoints
 from pipeline.simplification.fidelity import Fidelity, measure_simplification
-from pipeline.simplification.house_clusters import Shapes, simplify_houses
+from pipeline.simplification.house_clusters import Shapes
 from pipeline.simplification.roof_crossings import add_crossings
 
 COVERED = 0.5  # a house without a face is not lost if others cover this part of it
 CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
 SETTLE_ROUNDS = 20  # of grouping roofs and raising them over terrain, in turn
-
-
-def simplify_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, trace: Trace = no_trace) -> City:
-    """Simplify the city model so that it can be meshed (steps 2.1 to 2.3), in memory.
-
-    Parameters
-    ----------
-    city : City
-        Result of `build_city`.
-    cloud : PointCloud
-        Points of the houses and `ground_margin` around them.
-    dtm : Dtm
-        Terrain.
-    options : CityOptions
-        Parameters; `simplify` chooses the way.
-    trace : callable, optional
-        Context manager around each step.
-
-    Notes
-    -----
-    The tiles of a region take the same steps, cluster by cluster, and get the same model.
-    """
-    with trace("2.0 split levels"):
-        houses = divide_houses(city, cloud, options)
-    with trace("2.1 simplify"):
-        shapes = simplify_houses(houses.parts, houses.polygons, options, find_model_roofs(houses))
-    located = locate_roof_points(cloud, shapes.polygons, building_class=has_building_class(cloud))
-    reserved = set(city.model.ids.tolist())
-    simple = raise_buildings(houses, shapes, dtm, options, reserved=reserved, roof_points=located, trace=trace)
-    return replace(
-        simple, notes=(*city.notes, *houses.notes, *simple.notes), counts={**city.counts, **simple.counts}
-    )
 
 
 def raise_buildings(
@@ -89,10 +56,6 @@ def raise_buildings(
         The houses of these clusters.
     shapes : Shapes
         The clusters simplified; members are rows of the houses' parts.
-    dtm : Dtm
-        Terrain.
-    options : CityOptions
-        Parameters.
     reserved : set of str
         Ids that no part of a house may get: at least those of all houses that look like one of a part.
     roof_points : RoofPoints, optional

@@ -40,28 +40,15 @@ OELAND = "600 6270,602 6300,615 6350,625 6360,615 6310,606 6260"
 
 @dataclass(frozen=True)
 class Country:
-    """A country and its survey.
+    """A country and its survey."""
 
-    Attributes
-    ----------
-    name, crs : str
-        Name, and code of the CRS.
-    outlines : tuple of str
-        Corners of its polygons (km).
-    n_tiles : int
-        Tiles that it has: the outline is scaled to that area.
-    tile_size : float
-        Side of a tile (m).
-    sheet : (float, float)
-        Sides of a point-cloud file (m).
-    """
-
+    #: name, and code of the CRS
     name: str
     crs: str
-    outlines: tuple[str, ...]
-    n_tiles: int
-    tile_size: float
-    sheet: tuple[float, float]
+    outlines: tuple[str, ...]  #: corners of its polygons (km)
+    n_tiles: int  #: tiles that it has: the outline is scaled to that area
+    tile_size: float  #: side of a tile (m)
+    sheet: tuple[float, float]  #: sides of a point-cloud file (m)
 
 
 COUNTRIES = {

@@ -29,33 +29,16 @@ BORDERS = 4  # neighbours of a tile that is no border tile
 
 @dataclass(frozen=True)
 class Recorded:
-    """A task of a real run.
+    """A task of a real run."""
 
-    Attributes
-    ----------
-    seconds : float
-        Its wall time (s).
-    stored : int
-        Bytes of its result in the store.
-    stored_files : int
-        Number of files of these.
-    written : int
-        Bytes of the files beside the store that it states.
-    written_files : int
-        Number of these.
-    facts : dict
-        Its facts; ``"extent"`` from the lower left of its box, ``"names"`` by columns and rows from its own.
-    notes : int
-        Number of its notes.
-    """
-
-    seconds: float
-    stored: int
-    stored_files: int
-    written: int
-    written_files: int
+    seconds: float  #: its wall time (s)
+    stored: int  #: bytes of its result in the store
+    stored_files: int  #: number of files of these
+    written: int  #: bytes of the files beside the store that it states
+    written_files: int  #: number of these
+    #: its facts; ``"extent"`` from the lower left of its box, ``"names"`` by columns and rows from its own
     facts: Facts
-    notes: int
+    notes: int  #: number of its notes
 
 
 @cache

@@ -29,9 +29,9 @@ from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.roofs.house_roofs import RoofOptions, fit_roofs
 from pipeline.roofs.refit import refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, divide_roof_points, locate_roof_points, make_roof_points
-from pipeline.simplification.house_clusters import simplify_houses
 from tests.helpers.cities import CITY_OPTIONS
 from tests.helpers.sloped_roofs import town_of_slopes
+from tests.helpers.whole_city import simplify_houses
 from tests.helpers.whole_clouds import read_points
 from tiler.pointclouds.clouds import find_clouds
 

@@ -44,6 +44,12 @@ def write_city(folder: Path, *, suffix: str = "laz") -> Path:
     return folder
 
 
+def quick_run(city: Path, out: Path, footprints: str = "house.gpkg") -> list[str | Path]:
+    """Words of a quick run of the tiny city; no footprints where ``""`` is given."""
+    given: list[str | Path] = ["--footprints", city / footprints] if footprints else []
+    return ["run", city / "cloud.laz", *given, "--out", out, *QUICK]
+
+
 def write_cloud(path: Path, xyz: NDArray[np.float64], classes: Any) -> Path:
     """Write a LAS 1.4 file with a CRS."""
     header = laspy.LasHeader(point_format=6, version="1.4")

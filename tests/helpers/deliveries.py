@@ -72,50 +72,25 @@ def scan(step: float = 0.8) -> tuple[Array, NDArray[np.str_]]:
 
 @dataclass(frozen=True)
 class Delivery:
-    """How an agency delivers.
+    """How an agency delivers."""
 
-    Attributes
-    ----------
-    classes : dict
-        Class of what is ``"ground"``, ``"roof"``, ``"tree"``, ``"water"`` and ``"noise"``.
-    point_format, version
-        As in the header.
-    crs : str
-        CRS of the coordinates.
-    corner : (x, y)
-        Corner of the town there, in units of the CRS.
-    record : {"wkt", "wkt1", "keys", ""}
-        How the file states the CRS: WKT 2 or 1, GeoTIFF keys, not at all.
-    keys : dict
-        GeoTIFF keys, by number.
-    suffix : str
-        Of the file.
-    scale : float
-        Of the stored coordinates.
-    unit, unit_z : float
-        Unit of coordinates and of heights (m).
-    extra : tuple of str
-        Extra bytes, by name.
-    edit : callable, optional
-        Changes the points before they are written.
-    options : dict
-        Further parameters that a run needs.
-    """
-
-    classes: dict[str, int]
+    classes: dict[str, int]  #: class of what is ``"ground"``, ``"roof"``, ``"tree"``, ``"water"`` and ``"noise"``
+    #: as in the header
     point_format: int = 6
     version: str = "1.4"
-    crs: str = ""
-    corner: tuple[float, float] = (0.0, 0.0)
-    record: str = "wkt"
-    keys: Keys = field(default_factory=dict)
-    suffix: str = ".laz"
-    scale: float = 0.01
+    crs: str = ""  #: CRS of the coordinates
+    corner: tuple[float, float] = (0.0, 0.0)  #: (x, y): corner of the town there, in units of the CRS
+    record: str = "wkt"  #: how the file states the CRS: WKT 2 or 1, GeoTIFF keys, not at all
+    keys: Keys = field(default_factory=dict)  #: GeoTIFF keys, by number
+    suffix: str = ".laz"  #: of the file
+    scale: float = 0.01  #: of the stored coordinates
+    #: unit of coordinates and of heights (m)
     unit: float = 1.0
     unit_z: float = 1.0
-    extra: tuple[str, ...] = ()
+    extra: tuple[str, ...] = ()  #: extra bytes, by name
+    #: changes the points before they are written
     edit: Callable[[laspy.LasData, NDArray[np.str_]], None] | None = None
-    options: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)  #: further parameters that a run needs
 
 
 def write_delivery(folder: Path, delivery: Delivery) -> dict[str, Any]:

@@ -18,22 +18,13 @@ from typing import Any, Self
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a call came to.
+    """What a call came to."""
 
-    Attributes
-    ----------
-    code : int
-        Exit code; minus the signal's number where the process was ended by one; -1000 where it hung.
-    out, err : str
-        What was printed.
-    seconds : float
-        How long it took.
-    """
-
-    code: int
+    code: int  #: exit code; minus the signal's number where the process was ended by one; -1000 where it hung
+    #: what was printed
     out: str
     err: str
-    seconds: float
+    seconds: float  #: how long it took
 
 
 HUNG = -1000

@@ -56,21 +56,11 @@ NODE = "NodeName=node{k} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} CPUs
 
 @dataclass
 class Slurm:
-    """A SLURM at work; `environment` is for whoever talks to it.
+    """A SLURM at work; `environment` is for whoever talks to it."""
 
-    Attributes
-    ----------
-    folder : Path
-        Settings, state and logs.
-    environment : dict of str to str
-        That of this process, with the settings' path.
-    nodes : dict of str to Popen
-        The slurmd of each node.
-    """
-
-    folder: Path
-    environment: dict[str, str]
-    nodes: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
+    folder: Path  #: settings, state and logs
+    environment: dict[str, str]  #: that of this process, with the settings' path
+    nodes: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)  #: the slurmd of each node
 
     def ask(self, *words: str) -> str:
         """Run one of SLURM's commands; returns what it prints."""

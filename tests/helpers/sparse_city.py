@@ -26,22 +26,13 @@ VALUES = {"tile_size": TILE, "mesh_size": 20.0, "dtm_spacing": 4.0, "domain_heig
 
 @dataclass(frozen=True)
 class SparseCity:
-    """A synthetic city as files, its finished run, and what that has.
+    """A synthetic city as files, its finished run, and what that has."""
 
-    Attributes
-    ----------
-    folder, out : Path
-        The files, and the reference: a run in one process.
-    record : dict
-        Its record.
-    hashes : dict of str to str
-        Hash of each of its files.
-    """
-
+    #: the files, and the reference: a run in one process
     folder: Path
     out: Path
-    record: dict[str, Any]
-    hashes: dict[str, str]
+    record: dict[str, Any]  #: its record
+    hashes: dict[str, str]  #: hash of each of its files
 
     def config(self, out: Path, **others: Any) -> Config:
         """Parameters of a run."""

@@ -25,7 +25,6 @@ from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import signed_areas
 from pipeline.plane_mesh.sizes import Finer, SizeField, SizeRule, size_field
 from pipeline.points_terrain.terrain import Dtm, compute_dtm, sample_dtm
-from pipeline.simplification.simplify import simplify_city
 from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
 from stitch.seams.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.seams.seam_columns import fill_corner, fill_seam, tile_columns
@@ -47,6 +46,7 @@ from stitch.tiling.patches import mesh_patch
 from stitch.tiling.walls import cut_walls
 from tests.helpers.cities import CITY_OPTIONS, Bounds, city_of, crowded_blocks, hilly_dtm
 from tests.helpers.footprint_reading import read_footprints
+from tests.helpers.whole_city import simplify_city
 from tests.helpers.whole_clouds import read_points
 from tiler.pointclouds.clouds import find_clouds
 

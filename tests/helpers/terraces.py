@@ -7,13 +7,14 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.columns.columns import expand_cells, extract_boundary
+from pipeline.columns.columns import expand_cells
 from pipeline.data.citymodel import CityModel
 from pipeline.data.mesh import ColumnMesh, Marker
 from pipeline.plane_mesh.plane import signed_areas
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 from stitch.pieces.conformity import compute_cell_volumes, match_facets, pair_cell_faces, pair_edges
 from tests.helpers.cities import Bounds, city_of
+from tests.helpers.whole_city import extract_boundary
 
 # Boxes (west, south, east, north) and roofs (m). Walls are noded where another house's wall ends on them.
 HOUSES = (

@@ -20,28 +20,7 @@ def values_of(array: NDArray[Any]) -> Values:
 
 
 def write_vtu(path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell_data: Arrays = NO_ARRAYS) -> None:
-    """Write a volume mesh as a VTU file.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it appears whole or not at all.
-    mesh : TetMesh
-        The tetrahedra; coordinates are written as they are, float64 (m).
-    point_data, cell_data : mapping of name to array, first axis (n_points,) or (n_cells,)
-        Further arrays: float64, float32, int64, int32 or uint8.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    ValueError
-        If an array has another length or type.
-
-    Notes
-    -----
-    Same input, same bytes. Beside the input, memory holds one block.
-    """
+    """Write a volume mesh, with further arrays, as a VTU file."""
     write_vtu_blocks(
         path,
         Rows.of(mesh.points),
@@ -54,27 +33,7 @@ def write_vtu(path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell
 def write_vtp(
     path: Path, points: NDArray[np.float64], boundary: Boundary, *, point_data: Arrays = NO_ARRAYS
 ) -> None:
-    """Write the boundary of a volume mesh as a VTP file, with the points that it uses alone.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it appears whole or not at all.
-    points : float64, (n, 3)
-        Points of the volume mesh (m).
-    boundary : Boundary
-        Marked facets; `marker` and `building` become cell arrays.
-    point_data : mapping of name to array, first axis (n,)
-        Further arrays on the volume mesh's points. The array ``vertex``, each point's index among
-        `points`, is always there.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    ValueError
-        If an array has another length or type.
-    """
+    """Write the boundary of a volume mesh as a VTP file, with the points (n, 3) that it uses alone."""
     checked = _checked(point_data, len(points))
     data = {"vertex": VERTEX} | {name: values_of(array) for name, array in checked.items()}
     write_vtp_blocks(path, len(points), boundary, values_of(points), point_data=data)

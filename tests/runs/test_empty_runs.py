@@ -10,7 +10,7 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from tests.helpers.bad_input import HOUSE, QUICK, call, write_city
+from tests.helpers.bad_input import HOUSE, call, quick_run, write_city
 from tests.helpers.cities import Bounds
 from tiler.planning.region import Region
 from tiler.vectors.layers import Layer
@@ -42,7 +42,7 @@ WAYS = {
 }
 
 
-def write_moved(path: Path, way: str) -> Path:
+def write_moved(path: Path, way: str) -> None:
     """Write the house where it is not."""
     steps, crs, _ = WAYS[way]
     moved = HOUSE
@@ -57,24 +57,14 @@ def write_moved(path: Path, way: str) -> Path:
         crs=crs,
         driver="GPKG",
     )
-    return path
 
 
 @pytest.mark.filterwarnings("ignore:'crs' was not provided")
 @pytest.mark.parametrize("way", WAYS)
 def test_footprints_elsewhere_end_the_run_with_one(tmp_path: Path, capsys: Capture, way: str) -> None:
     city = write_city(tmp_path / "city")
-    moved = write_moved(city / "moved.gpkg", way)
-    command: list[str | Path] = [
-        "run",
-        city / "cloud.laz",
-        "--footprints",
-        moved,
-        "--out",
-        city / "out",
-        "-q",
-        *QUICK,
-    ]
+    write_moved(city / "moved.gpkg", way)
+    command = [*quick_run(city, city / "out", "moved.gpkg"), "-q"]
     found = call(capsys, *command)
     assert found.code == 1
     assert found.err.startswith("citystitch: no building was meshed. ")
@@ -90,15 +80,7 @@ def test_footprints_elsewhere_end_the_run_with_one(tmp_path: Path, capsys: Captu
 
 def test_what_was_dropped_is_told(tmp_path: Path, capsys: Capture) -> None:
     city = write_city(tmp_path / "city")
-    command: list[str | Path] = [
-        "run",
-        city / "cloud.laz",
-        "--footprints",
-        city / "house.gpkg",
-        "--out",
-        city / "out",
-        *QUICK,
-    ]
+    command = quick_run(city, city / "out")
     found = call(capsys, *command, "--min-building-area", "100000")
     assert found.code == 1
     assert "1 of them in the region" in found.err
@@ -109,15 +91,7 @@ def test_what_was_dropped_is_told(tmp_path: Path, capsys: Capture) -> None:
 
 def test_an_empty_mesh_is_taken_where_it_is_allowed(tmp_path: Path, capsys: Capture) -> None:
     city = write_city(tmp_path / "city")
-    command: list[str | Path] = [
-        "run",
-        city / "cloud.laz",
-        "--out",
-        city / "out",
-        *QUICK,
-        "--min-building-area",
-        "100000",
-    ]
+    command = [*quick_run(city, city / "out", ""), "--min-building-area", "100000"]
     assert call(capsys, *command, "--footprints", city / "house.gpkg", "--allow-empty").code in (0, 3)
     assert call(capsys, *command).code == 0  # without footprints it is terrain, and meant to be
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
-from pipeline.columns.columns import expand_cells, extract_boundary, find_used_points, split_boundary
+from pipeline.columns.columns import expand_cells, find_used_points, split_boundary
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import Boundary, ColumnMesh, Marker, SeamEdges
 from pipeline.plane_mesh.plane import mesh_plane
@@ -47,6 +47,7 @@ from tests.helpers.stitching import (
     scene_of,
 )
 from tests.helpers.terraces import terrace_town
+from tests.helpers.whole_city import extract_boundary
 from tiler.stages.pieces import prove_seams
 
 Split = tuple[ColumnMesh, Boundary, NDArray[np.int32]]

@@ -32,25 +32,14 @@ HEAD = ("quantity", "value", COST, AIJ, "option that would mend it")
 
 @dataclass(frozen=True)
 class CfdRow:
-    """One quantity.
+    """One quantity."""
 
-    Attributes
-    ----------
-    name, value : str
-        What was measured, in words.
-    bounds : tuple of str
-        What COST 732 and AIJ ask, in words.
-    passed : tuple of bool
-        Whether each is met.
-    option : str
-        What would mend it.
-    """
-
+    #: what was measured, in words
     name: str
     value: str
-    bounds: tuple[str, str]
-    passed: tuple[bool, bool]
-    option: str
+    bounds: tuple[str, str]  #: what COST 732 and AIJ ask, in words
+    passed: tuple[bool, bool]  #: whether each is met
+    option: str  #: what would mend it
 
     def cells(self) -> tuple[str, ...]:
         """Return the row of the table."""

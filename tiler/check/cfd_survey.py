@@ -45,31 +45,18 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class CfdSurvey:
-    """What was measured.
+    """What was measured."""
 
-    Attributes
-    ----------
-    bounds : tuple of 4 floats
-        West, south, east and north side of the domain (m).
-    blocks : Blocks
-        The buildings.
-    top, ground : float
-        Lowest point of the top, and mean of the ground (m).
-    growth : Histogram
-        Of each two cells one above the other in a column's corner, the longer over the shorter.
-    first, second : Histogram
-        Heights above ground of the first and second node over each vertex of the ground (m).
-    cells_a_side : float64, (n,)
-        Of each building the cube root of its volume over the length of edges on it; NaN where it has no facets.
-    """
-
-    bounds: Bounds
-    blocks: Blocks
+    bounds: Bounds  #: west, south, east and north side of the domain (m)
+    blocks: Blocks  #: the buildings
+    #: lowest point of the top, and mean of the ground (m)
     top: float
     ground: float
-    growth: Histogram
+    growth: Histogram  #: of each two cells one above the other in a column's corner, the longer over the shorter
+    #: heights above ground of the first and second node over each vertex of the ground (m)
     first: Histogram
     second: Histogram
+    #: (n,): cube root of each building's volume over the length of edges on it; NaN where it has no facets
     cells_a_side: Floats
 
     @property

@@ -33,26 +33,15 @@ BOUNDARY_INDEX = "boundary.pvtp"
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What was proved of a run folder.
+    """What was proved of a run folder."""
 
-    Attributes
-    ----------
-    directory : Path
-        The folder.
-    proofs : tuple of Proof
-        All claims, in a fixed order, with the faults of each.
-    remarks : tuple of str
-        What is no fault, but must be known before a solver runs.
-    facts : mapping of str to float
-        Numbers read on the way: ``cells``, ``points``, ``facets``, ``building parts``, ``non_manifold_edges``,
-        ``volume`` and ``smallest_cell`` (m³), ``seam_faces``, ``missing_facets``, ``parts`` of the air that
-        share no face.
-    """
-
-    directory: Path
-    proofs: tuple[Proof, ...]
+    directory: Path  #: the folder
+    proofs: tuple[Proof, ...]  #: all claims, in a fixed order, with the faults of each
+    #: numbers read on the way: ``cells``, ``points``, ``facets``, ``building parts``, ``non_manifold_edges``,
+    #: ``volume`` and ``smallest_cell`` (m³), ``seam_faces``, ``missing_facets``, ``parts`` of the air that share
+    #: no face
     facts: Mapping[str, float]
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  #: what is no fault, but must be known before a solver runs
 
     @property
     def faults(self) -> tuple[Fault, ...]:

@@ -35,102 +35,47 @@ ANY, GROUND, TOP = range(3)
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """What the proofs need of one piece once its cells are let go.
+    """What the proofs need of one piece once its cells are let go."""
 
-    Attributes
-    ----------
-    n_cells, n_points : int
-        Cells, and points that are not over the rim.
-    volumes : mapping of str to float
-        Volume of all cells of each region, ``air`` and so on (m³).
-    smallest : float
-        Volume of the smallest cell (m³).
-    surface : Surface
-        Its boundary file, on the distinct vertices of this and of the exterior faces.
-    part_cells, part_air : int64, bool, (p,)
-        Cells of each part of a region that hang together by faces, and whether it is air.
-    outline : float64, (k, 2, 2)
-        Edges of its plan.
-    rim : Rim
-        What it has over those of them that are not on the region's border.
-    on_rim : bool, (n,)
-        Which of the surface's points are over the rim.
-    same_boundary, closed : Finding
-        What the piece alone says of these claims.
-    between : mapping of str to Finding
-        What it says of each interface of regions, by name.
-    houses : float64, (h, 3)
-        A place of a cell of a building over each triangle of the plan that has one (m).
-    crowded : float64, (c, 2, 3)
-        Boundary edges of more than two facets, paired, not over the rim.
-    leaves : Finding
-        What it alone says of the leaves in its cells.
-    faults : tuple of Fault
-        Of its cells.
-    upright : float64, (c, 4)
-        Place of each column of the air, and its shortest and longest vertical edge (m); none unless asked for.
-    patch : int8, (k,), or None
-        Patch of the ground of each facet of the surface; None where the file tells of none.
-    """
-
+    #: cells, and points that are not over the rim
     n_cells: int
     n_points: int
-    volumes: Mapping[str, float]
-    smallest: float
-    surface: Surface
+    volumes: Mapping[str, float]  #: volume of all cells of each region, ``air`` and so on (m³)
+    smallest: float  #: volume of the smallest cell (m³)
+    surface: Surface  #: its boundary file, on the distinct vertices of this and of the exterior faces
+    #: (p,): cells of each part of a region that hang together by faces, and whether it is air
     part_cells: NDArray[np.int64]
     part_air: Mask
-    outline: Vertices
-    rim: Rim
-    on_rim: Mask
+    outline: Vertices  #: (k, 2, 2): edges of its plan
+    rim: Rim  #: what it has over those of them that are not on the region's border
+    on_rim: Mask  #: (n,): which of the surface's points are over the rim
+    #: what the piece alone says of these claims
     same_boundary: Finding
     closed: Finding
-    between: Mapping[str, Finding]
-    houses: Vertices
-    crowded: Vertices
-    leaves: Finding
-    faults: tuple[Fault, ...]
+    between: Mapping[str, Finding]  #: what it says of each interface of regions, by name
+    houses: Vertices  #: (h, 3): a place of a cell of a building over each triangle of the plan that has one (m)
+    crowded: Vertices  #: (c, 2, 3): boundary edges of more than two facets, paired, not over the rim
+    leaves: Finding  #: what it alone says of the leaves in its cells
+    faults: tuple[Fault, ...]  #: of its cells
+    #: (c, 4): place of each column of the air, its shortest and longest vertical edge (m); none unless asked for
     upright: NDArray[np.float64]
+    #: (k,): patch of the ground of each facet of the surface; None where the file tells of none
     patch: NDArray[np.int8] | None
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """What is kept of the cells of a piece.
-
-    Attributes
-    ----------
-    n_cells : int
-        How many they are.
-    points : float64, (n, 3)
-        Points of the volume (m).
-    volumes, smallest, houses
-        As of `Piece`.
-    exterior : int32, (k, 3)
-        Faces of one cell, as rows of the points.
-    between : mapping of str to int32 (g, 3)
-        Faces of each interface of regions, pointing out of its first.
-    side : int8, (k,)
-        Region of the cell behind each exterior face.
-    part : int64, (k,)
-        Part of the mesh behind each exterior face.
-    part_cells, part_air
-        As of `Piece`.
-    leaves, upright
-        As of `Piece`.
-    faults : tuple of Fault
-        Of cells and faces.
-    """
+    """What is kept of the cells of a piece; other fields are as of `Piece`."""
 
     n_cells: int
-    points: Vertices
+    points: Vertices  # of the volume
     volumes: Mapping[str, float]
     smallest: float
     houses: Vertices
-    exterior: NDArray[np.int32]
-    between: Mapping[str, NDArray[np.int32]]
-    side: NDArray[np.int8]
-    part: NDArray[np.int64]
+    exterior: NDArray[np.int32]  # (k, 3): faces of one cell, as rows of the points
+    between: Mapping[str, NDArray[np.int32]]  # faces of each interface of regions, pointing out of its first
+    side: NDArray[np.int8]  # (k,): region of the cell behind each exterior face
+    part: NDArray[np.int64]  # (k,): part of the mesh behind each exterior face
     part_cells: NDArray[np.int64]
     part_air: Mask
     leaves: Finding

@@ -124,22 +124,13 @@ def prove_walls(found: Finding) -> Proof:
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """What pieces have of each building of the city model.
+    """What pieces have of each building of the city model."""
 
-    Attributes
-    ----------
-    roof_area : float64, (n,)
-        Plan area of its roof facets (m²).
-    n_roofs, n_walls : int32, (n,)
-        Roof and wall facets.
-    plan_area : float64, (n,)
-        How much of its footprint lies in the plan of the pieces (m²).
-    """
-
-    roof_area: NDArray[np.float64]
+    roof_area: NDArray[np.float64]  #: (n,): plan area of its roof facets (m²)
+    #: (n,): roof and wall facets
     n_roofs: NDArray[np.int32]
     n_walls: NDArray[np.int32]
-    plan_area: NDArray[np.float64]
+    plan_area: NDArray[np.float64]  #: (n,): how much of its footprint lies in the plan of the pieces (m²)
 
 
 def find_built(surface: Surface, buildings: Buildings, outline: Vertices) -> Built:

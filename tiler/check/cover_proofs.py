@@ -31,8 +31,6 @@ def check_cover(
 
     Parameters
     ----------
-    surface : Surface
-        Boundary of a piece.
     patch : int8, (k,), or None
         Patch of each facet as the piece's file has it.
     ground : sequence of GroundPatch

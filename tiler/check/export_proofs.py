@@ -34,21 +34,12 @@ WIDTHS = {"wedge": 6, "pyramid": 5, "tetra": 4}
 
 @dataclass(frozen=True, eq=False)
 class Polyhedra:
-    """Cells by their faces.
+    """Cells by their faces."""
 
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Points by their numbers (m).
-    faces : int64, (k, 4)
-        All faces of each cell, counter-clockwise seen from outside; `NO_CORNER` in the last place of a triangle.
-    cell : int64, (k,)
-        The cell of each.
-    """
-
-    points: Vertices
+    points: Vertices  #: (n, 3): points by their numbers (m)
+    #: (k, 4): faces of each cell, counter-clockwise from outside; the last corner of a triangle is `NO_CORNER`
     faces: Ints
-    cell: Ints
+    cell: Ints  #: (k,): the cell of each
 
 
 def check_export(directory: Path, path: Path) -> CheckReport:
@@ -56,8 +47,6 @@ def check_export(directory: Path, path: Path) -> CheckReport:
 
     Parameters
     ----------
-    directory : Path
-        Folder of the run.
     path : Path
         A VTU, MSH, XDMF or CGNS file, or a case folder of OpenFOAM, whole or decomposed.
 

@@ -31,73 +31,39 @@ LoadDtm = Callable[[Path], Dtm]
 
 @dataclass(frozen=True)
 class PieceTask:
-    """A piece to survey.
+    """A piece to survey."""
 
-    Attributes
-    ----------
-    directory : Path
-        Folder of the run.
-    volume, boundary : str
-        The files of the piece, below it.
-    shared : Path
-        Folder of the check: has the index of buildings.
-    out : Path
-        Where the survey is to be put.
-    load_dtm : callable
-        Given the path of the store, returns the terrain.
-    """
-
-    directory: Path
+    directory: Path  #: folder of the run
+    #: the files of the piece, below it
     volume: str
     boundary: str
-    shared: Path
-    out: Path
-    load_dtm: LoadDtm
+    shared: Path  #: folder of the check: has the index of buildings
+    out: Path  #: where the survey is to be put
+    load_dtm: LoadDtm  #: given the path of the store, returns the terrain
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What a piece says of all claims, and what it has over its rim.
+    """What a piece says of all claims, and what it has over its rim."""
 
-    Attributes
-    ----------
-    found : dict of str to Finding
-        What it alone says, by claim.
-    rows : int64, (b,)
-        Rows of the buildings that it may have anything of.
-    built : Built
-        What it has of each of these.
-    n_cells, n_points, n_facets : int
-        Cells, points that are not over the rim, and facets.
-    smallest : float
-        Volume of the smallest cell (m³).
-    faults : tuple of Fault
-        Of its cells.
-    crowded : float64, (c, 2, 3)
-        Boundary edges of more than two facets, paired, not over the rim.
-    part_cells, part_air, rim
-        As of `Piece`.
-    terrain, level : float64, (p,)
-        Height of the terrain at each point of the rim that is ground, and level of the water there, if any (m).
-    rim_walls : Walls
-        Walls over the rim.
-    """
-
-    found: dict[str, Finding]
-    rows: NDArray[np.int64]
-    built: city_proofs.Built
+    found: dict[str, Finding]  #: what it alone says, by claim
+    rows: NDArray[np.int64]  #: (b,): rows of the buildings that it may have anything of
+    built: city_proofs.Built  #: what it has of each of these
+    #: cells, points that are not over the rim, and facets
     n_cells: int
     n_points: int
     n_facets: int
-    smallest: float
-    faults: tuple[Fault, ...]
-    crowded: Vertices
+    smallest: float  #: volume of the smallest cell (m³)
+    faults: tuple[Fault, ...]  #: of its cells
+    crowded: Vertices  #: (c, 2, 3): boundary edges of more than two facets, paired, not over the rim
+    #: as of `Piece`
     part_cells: NDArray[np.int64]
     part_air: Mask
     rim: Rim
+    #: (p,): height of the terrain at each point of the rim that is ground, and level of water there, if any (m)
     terrain: NDArray[np.float64]
     level: NDArray[np.float64]
-    rim_walls: wall_proofs.Walls
+    rim_walls: wall_proofs.Walls  #: walls over the rim
 
 
 def survey_piece(task: PieceTask) -> None:

@@ -40,24 +40,13 @@ class Dtm(Protocol):
 
 @dataclass(frozen=True)
 class Fault:
-    """One way in which a claim does not hold.
+    """One way in which a claim does not hold."""
 
-    Attributes
-    ----------
-    kind : str
-        Which rule, in kebab case.
-    count : int
-        How often.
-    places : tuple of (x, y, z)
-        The first few places (m); empty where the fault has none.
-    detail : str
-        The observed value against its bound.
-    """
-
-    kind: str
-    count: int
+    kind: str  #: which rule, in kebab case
+    count: int  #: how often
+    #: each (x, y, z): the first few places (m); empty where the fault has none
     places: tuple[tuple[float, float, float], ...]
-    detail: str
+    detail: str  #: the observed value against its bound
 
 
 @dataclass(frozen=True)
@@ -70,43 +59,24 @@ class Proof:
 
 @dataclass(frozen=True)
 class Finding:
-    """What pieces say of a claim.
+    """What pieces say of a claim."""
 
-    Attributes
-    ----------
-    faults : tuple of Fault
-        Those of one kind are one.
-    sums, largest : mapping of str to float
-        Numbers by name: those that add up over pieces, and those of which the largest counts.
-    """
-
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Fault, ...] = ()  #: those of one kind are one
+    #: numbers by name: those that add up over pieces, and those of which the largest counts
     sums: Mapping[str, float] = field(default_factory=dict)
     largest: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The boundary of one piece.
+    """The boundary of one piece."""
 
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Distinct vertices (m) of the exterior faces and of the boundary file.
-    boundary : Boundary
-        All facets.
-    corners : float64, (k, 3, 3)
-        The vertices of each facet.
-    moved : float64, (k, 3)
-        By how much the file says that the roof at each of these was moved for the sake of cells (m).
-    area, volume : float64, (k,)
-        Signed plan area (m²) and volume above height zero (m³), see `compute_facet_areas`.
-    """
-
-    points: Vertices
-    boundary: Boundary
-    corners: Vertices
+    points: Vertices  #: (n, 3): distinct vertices (m) of the exterior faces and of the boundary file
+    boundary: Boundary  #: all facets
+    corners: Vertices  #: (k, 3, 3): the vertices of each facet
+    #: (k, 3): by how much the file says that the roof at each of these was moved for the sake of cells (m)
     moved: NDArray[np.float64]
+    #: (k,): signed plan area (m²) and volume above height zero (m³), see `compute_facet_areas`
     area: NDArray[np.float64]
     volume: NDArray[np.float64]
 
@@ -166,8 +136,6 @@ def check_cells(mesh: TetMesh, region: NDArray[np.int8]) -> Finding:
 
     Parameters
     ----------
-    mesh : TetMesh
-        Cells of a piece.
     region : int8, (m,)
         `pipeline.data.mesh.Region` of each.
 
@@ -311,8 +279,6 @@ def check_box(surface: Surface, bounds: Bounds, outline: Vertices) -> Finding:
 
     Parameters
     ----------
-    surface : Surface
-        Boundary of a piece.
     bounds : (west, south, east, north)
         The box (m).
     outline : float64, (k, 2, 2)
@@ -403,8 +369,6 @@ def check_sizes(surface: Surface, outline: Vertices, cell_volume: float) -> Find
 
     Parameters
     ----------
-    surface : Surface
-        Boundary of a piece.
     outline : float64, (k, 2, 2)
         All edges of its plan, with the piece on the left.
     cell_volume : float

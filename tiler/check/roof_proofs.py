@@ -21,18 +21,12 @@ OUTLINE_TOLERANCE = 2e-3  # m, in the plane: CityJSON rounds coordinates to 1 mm
 
 @dataclass(frozen=True, eq=False)
 class RoofRange:
-    """Between which heights roofs may stand at ``k`` places.
+    """Between which heights roofs may stand at ``k`` places."""
 
-    Attributes
-    ----------
-    low, high : float64, (k,)
-        Heights (m); equal where a roof must lie on its plane. NaN where no building is.
-    edge : bool, (k,)
-        Whether a roof may be moved there by `RoofRules.slack` besides: at outlines, where roofs slope.
-    """
-
+    #: (k,): heights (m); equal where a roof must lie on its plane. NaN where no building is
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    #: (k,): whether a roof may be moved there by `RoofRules.slack` besides: at outlines, where roofs slope
     edge: NDArray[np.bool_]
 
 
@@ -45,8 +39,6 @@ def find_roof_range(xy: NDArray[np.float64], buildings: Buildings, dtm: Dtm, rul
         Places (m).
     buildings : Buildings
         All buildings that touch one of them.
-    dtm : Dtm
-        Terrain.
     rules : RoofRules
         How far roofs may be moved at outlines.
     """

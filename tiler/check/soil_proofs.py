@@ -182,8 +182,6 @@ def check_building_cells(surface: Surface, cells: float, places: Vertices, build
 
     Parameters
     ----------
-    surface : Surface
-        Boundary of a piece.
     cells : float
         Volume of its cells of buildings (m³).
     places : float64, (k, 3)

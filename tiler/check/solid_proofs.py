@@ -109,8 +109,6 @@ def check_solids(
 
     Parameters
     ----------
-    path : Path
-        The city model.
     vertices : Vertices
         Its vertices.
     title : str
@@ -232,22 +230,12 @@ class _Found:
 
 
 class _Batch:
-    """Some buildings of a city model, with the solids that have to be right, gathered to be looked at together.
-
-    Attributes
-    ----------
-    buildings : list of BuildingRow
-        The buildings.
-    n_solids, n_flat : int
-        Solids of all levels of detail, and buildings without any.
-    sloped : list of bool
-        Of each solid that must be there: whether it has a sloped roof.
-    """
+    """Some buildings of a city model, with the solids that have to be right, gathered to be looked at together."""
 
     def __init__(self) -> None:
         self.buildings: list[BuildingRow] = []
-        self.n_solids = self.n_flat = 0
-        self.sloped: list[bool] = []
+        self.n_solids = self.n_flat = 0  # solids of all levels of detail, and buildings without any
+        self.sloped: list[bool] = []  # of each solid that must be there
         self._height: list[float] = []  # of each building: its attribute
         self._block: list[float] = []  # of each building: its attribute for LoD1.3, or NaN
         # Of each building: its attributes `ROOF_NUMBERS`, NaN for none

@@ -18,21 +18,12 @@ OVERLAP = 1e-9  # of the area of walls over an edge: what may be there twice
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """Walls over ``e`` edges of the plan.
+    """Walls over ``e`` edges of the plan."""
 
-    Attributes
-    ----------
-    ends : float64, (e, 2, 2)
-        The edges (m), each once, with the smaller end first.
-    area : float64, (e, 2)
-        Area of the facets that face to the left of the edge, and of those that face to the right (m²).
-    top : float64, (e,)
-        Highest corner (m).
-    """
-
-    ends: NDArray[np.float64]
+    ends: NDArray[np.float64]  #: (e, 2, 2): the edges (m), each once, with the smaller end first
+    #: (e, 2): area of the facets that face to the left of the edge, and of those that face to the right (m²)
     area: NDArray[np.float64]
-    top: NDArray[np.float64]
+    top: NDArray[np.float64]  #: (e,): highest corner (m)
 
 
 def no_walls() -> Walls:

@@ -81,8 +81,6 @@ def check_reach(path: Path, values: Mapping[str, Any]) -> None:
 
     Parameters
     ----------
-    path : Path
-        The file.
     values : mapping
         The parameters that it gives, less those that the command line gives.
 

@@ -31,18 +31,10 @@ LEAST_NODES = 4  # of the terrain's grid, across a pad: the outermost ones are l
 
 @dataclass(frozen=True)
 class Domain:
-    """The domain of a region, as the stages from its seams on have it.
+    """The domain of a region, as the stages from its seams on have it."""
 
-    Attributes
-    ----------
-    height : float
-        Height above the smoothed terrain, or above the highest terrain where the top is flat (m).
-    top : float or None
-        Absolute height of a flat top (m); None where the top follows the terrain.
-    """
-
-    height: float
-    top: float | None
+    height: float  #: height above the smoothed terrain, or above the highest terrain where the top is flat (m)
+    top: float | None  #: absolute height of a flat top (m); None where the top follows the terrain
 
 
 def read_height(value: Height, name: str = "domain_height") -> Height:

@@ -29,8 +29,6 @@ def find_levels(zones: Zones, xy: NDArray[np.float64]) -> NDArray[np.int8]:
 
     Parameters
     ----------
-    zones : Zones
-        With the rest.
     xy : float64, (n, 2)
         Places in the region's CRS (m).
 

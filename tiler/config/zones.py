@@ -24,40 +24,20 @@ Zones = tuple[tuple[str, float, str], ...]
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle with a level of detail and a target edge length.
+    """A circle with a level of detail and a target edge length."""
 
-    Attributes
-    ----------
-    level : str
-        One of `LEVELS`.
-    size : float
-        Target edge length (m).
-    place : (x, y, radius)
-        In the region's CRS (m).
-    """
-
-    level: str
-    size: float
-    place: tuple[float, float, float]
+    level: str  #: one of `LEVELS`
+    size: float  #: target edge length (m)
+    place: tuple[float, float, float]  #: (x, y, radius): in the region's CRS (m)
 
 
 @dataclass(frozen=True)
 class ZonesAsked:
-    """What options say of zones.
+    """What options say of zones."""
 
-    Attributes
-    ----------
-    circles : tuple of Circle
-        Circles of both options.
-    files : tuple of str
-        Vector files of further zones.
-    rest : str
-        Level of all that lies in no zone.
-    """
-
-    circles: tuple[Circle, ...]
-    files: tuple[str, ...]
-    rest: str
+    circles: tuple[Circle, ...]  #: circles of both options
+    files: tuple[str, ...]  #: vector files of further zones
+    rest: str  #: level of all that lies in no zone
 
 
 def is_file(text: str) -> bool:

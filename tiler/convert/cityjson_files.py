@@ -22,27 +22,14 @@ THEME = "facades"  # of textures
 
 @dataclass
 class Textures:
-    """Textures of a document or of a feature: pages in a folder beside the file, and places on them.
+    """Textures of a document or of a feature: pages in a folder beside the file, and places on them."""
 
-    Attributes
-    ----------
-    pages : Pages
-        Where pictures are put.
-    folder : str
-        Name of the folder of pages, see `page_name`.
-    used : dict
-        Number of each page among the textures.
-    places : list
-        Places on pages that are not written yet; u to the right, v upwards, from 0 to 1.
-    n_written : int
-        Number of those that are.
-    """
-
-    pages: Pages
-    folder: str
-    used: dict[int, int] = field(default_factory=dict)
+    pages: Pages  #: where pictures are put
+    folder: str  #: name of the folder of pages, see `page_name`
+    used: dict[int, int] = field(default_factory=dict)  #: number of each page among the textures
+    #: places on pages that are not written yet; u to the right, v upwards, from 0 to 1
     places: list[list[float]] = field(default_factory=list)
-    n_written: int = 0
+    n_written: int = 0  #: number of those that are
 
     def show(self, item: Geometry, xyz: NDArray[np.float64]) -> dict[str, Any]:
         """Give what shows on the faces of a geometry, whose vertices are at `xyz`, float64 (n, 3)."""

@@ -67,8 +67,6 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
         CityJSON, CityJSONSeq, CityGML or GeoPackage files, or the folder of a run.
     output : Path
         The file, or with a size of tiles the folder of their files ``i_j``; it appears whole or not at all.
-    asked : Asked
-        What is asked.
 
     Raises
     ------

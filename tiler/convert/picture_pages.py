@@ -27,21 +27,11 @@ class Place:
 
 @dataclass
 class Pages:
-    """Pages as they are filled; those that are full are in a file, one behind the other.
+    """Pages as they are filled; those that are full are in a file, one behind the other."""
 
-    Attributes
-    ----------
-    colours : mapping
-        As of `draw_picture`.
-    file : file
-        Where pages are put.
-    sizes : list of int
-        Bytes of each page in it, a multiple of 4.
-    """
-
-    colours: Colours
-    file: IO[bytes]
-    sizes: list[int] = field(default_factory=list)
+    colours: Colours  #: as of `draw_picture`
+    file: IO[bytes]  #: where pages are put
+    sizes: list[int] = field(default_factory=list)  #: bytes of each page in it, a multiple of 4
     _page: Image | None = None
     _drawn: dict[Insert, Image] = field(default_factory=dict)
     _places: dict[object, Place] = field(default_factory=dict)

@@ -20,27 +20,13 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Question:
-    """What a page wants to see.
+    """What a page wants to see."""
 
-    Attributes
-    ----------
-    stage : str
-        States and values of this step or stage alone; of all where it is empty.
-    value : str
-        Value to colour by, as of `Items.values`; none where it is empty.
-    view : (xmin, ymin, xmax, ymax) or None
-        The part of the region (m); all of it where it is None.
-    since : int
-        Version that the page has; it gets what changed after it.
-    key : str
-        ``key`` of the answer that it has; another one makes it get everything.
-    """
-
-    stage: str = ""
-    value: str = ""
-    view: Box | None = None
-    since: int = 0
-    key: str = ""
+    stage: str = ""  #: states and values of this step or stage alone; of all where it is empty
+    value: str = ""  #: value to colour by, as of `Items.values`; none where it is empty
+    view: Box | None = None  #: (xmin, ymin, xmax, ymax): the part of the region (m); all of it where it is None
+    since: int = 0  #: version that the page has; it gets what changed after it
+    key: str = ""  #: ``key`` of the answer that it has; another one makes it get everything
 
 
 def describe_map(model: RunState, run: str, question: Question) -> dict[str, Any]:
@@ -48,12 +34,8 @@ def describe_map(model: RunState, run: str, question: Question) -> dict[str, Any
 
     Parameters
     ----------
-    model : RunState
-        The run.
     run : str
         Name of the run's file, part of the key.
-    question : Question
-        What is asked.
 
     Returns
     -------

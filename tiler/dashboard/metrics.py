@@ -40,8 +40,6 @@ def families(model: RunState, *, alive: bool, share: float = 1.0) -> list[Family
 
     Parameters
     ----------
-    model : RunState
-        The run.
     alive : bool
         Whether it is at work.
     share : float

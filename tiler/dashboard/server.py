@@ -75,8 +75,6 @@ def serve(follower: EventReader, address: str = ANYWHERE) -> Iterator[str]:
 
     Parameters
     ----------
-    follower : EventReader
-        The run.
     address : str
         Where to listen, see `read_address`.
 
@@ -148,8 +146,6 @@ def mounted(follower: EventReader, scheduler: Any, address: str) -> Iterator[str
 
     Parameters
     ----------
-    follower : EventReader
-        The run.
     scheduler : distributed.Scheduler
         The scheduler.
     address : str
@@ -175,8 +171,6 @@ def watched(out: Path, address: str | None, scheduler: Any | None, say: Callable
 
     Parameters
     ----------
-    out : Path
-        Folder of the run.
     address : str or None
         Where to listen; None shows nothing.
     scheduler : distributed.Scheduler or None
@@ -211,10 +205,6 @@ def show_folder(folder: Path, address: str, say: Callable[[str], None]) -> None:
     ----------
     folder : Path
         Folder of a run, at work, ended or dead.
-    address : str
-        Where to listen.
-    say : callable
-        Called with the URL.
 
     Raises
     ------

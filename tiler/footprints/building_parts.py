@@ -93,8 +93,6 @@ def share_places(
 
     Parameters
     ----------
-    parts : BuildingParts
-        All parts.
     geometry : object, (k,)
         Polygons and MultiPolygons of the file.
     is_one : bool, (k,)

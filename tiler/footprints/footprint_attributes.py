@@ -78,8 +78,6 @@ def read_heights(
 
     Parameters
     ----------
-    layer : Layer
-        Where they come from.
     height_name : str
         Attribute with heights; ``""`` for none, or for the tags of OSM data.
     features : Features

@@ -126,8 +126,6 @@ def make_footprints(
 
     Parameters
     ----------
-    source : FootprintSource
-        Where they come from.
     features : Features
         Any of its features, with the attributes that `FootprintSource.columns` names.
     repeated : set of str

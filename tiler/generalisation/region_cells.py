@@ -28,8 +28,6 @@ def join_across(numbers: Numbers, found: Iterable[Index], shards: Shards, kind: 
 
     Parameters
     ----------
-    numbers : Numbers
-        Of all things.
     found : iterable of int64, (p, 2)
         Pairs of things of each tile with those of its own column of tiles and of the next one.
     kind : str

@@ -110,18 +110,10 @@ class DiskSet:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Numbers of things that lie in tiles, over the whole region: those of a tile follow each other.
+    """Numbers of things that lie in tiles, over the whole region: those of a tile follow each other."""
 
-    Attributes
-    ----------
-    tiles : int64, (t, 2)
-        Column and row of each tile, ascending.
-    start : int64, (t + 1,)
-        First number of each tile, and the number of all.
-    """
-
-    tiles: NDArray[np.int64]
-    start: NDArray[np.int64]
+    tiles: NDArray[np.int64]  #: (t, 2): column and row of each tile, ascending
+    start: NDArray[np.int64]  #: (t + 1,): first number of each tile, and the number of all
 
     @classmethod
     def count(cls, tiles: Sequence[Tile], counts: Iterable[int]) -> "Numbers":

@@ -102,8 +102,6 @@ def draw(run: RunState, width: int, height: int, *, now: float, plain: bool = Fa
 
     Parameters
     ----------
-    run : RunState
-        What is known.
     width, height : int
         Characters and rows of the terminal.
     now : float

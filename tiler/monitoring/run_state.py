@@ -22,24 +22,12 @@ FINISHED = (State.DONE, State.REUSED)
 
 @dataclass
 class Interval:
-    """What happened in an interval.
+    """What happened in an interval."""
 
-    Attributes
-    ----------
-    done : int
-        Items that were finished, those taken from an earlier run left out.
-    seconds : float
-        Their wall time (s).
-    memory : int
-        Largest memory of a process that any of them told (bytes); 0 if none.
-    running : int
-        Items at work at its end; -1 if nothing was told.
-    """
-
-    done: int = 0
-    seconds: float = 0.0
-    memory: int = 0
-    running: int = -1
+    done: int = 0  #: items that were finished, those taken from an earlier run left out
+    seconds: float = 0.0  #: their wall time (s)
+    memory: int = 0  #: largest memory of a process that any of them told (bytes); 0 if none
+    running: int = -1  #: items at work at its end; -1 if nothing was told
 
 
 class Series:

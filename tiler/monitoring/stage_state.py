@@ -30,37 +30,20 @@ REUSE = 0.005  # s to look at a result that is taken as it is
 
 @dataclass
 class StageState:
-    """How far a stage is, or a group of stages.
+    """How far a stage is, or a group of stages."""
 
-    Attributes
-    ----------
-    scope : str
-        ``"file"``, ``"tile"``, ``"seam"`` or ``"region"``; empty if it was not told.
-    total, done, in_hand : int
-        Its items as planned last; those done, used again or not, and those that workers have.
-    lost : set of str
-        Items that failed or are not run, of a group with their stages.
-    seconds : float
-        Wall time of all items done (s).
-    began : float
-        When its first item was given to a worker (s since 1970); 0 before that.
-    finished : float
-        When the last item was done (s after the start of the run); 0 before that.
-    codes : dict of str to int
-        State of its items by name, where its scope has no boxes; those of tiles and seams are in `Items`.
-    counts : Counter
-        Number of items in each state but `State.WAITING`, those that are planned no more among them.
-    """
-
-    scope: str = ""
+    scope: str = ""  #: ``"file"``, ``"tile"``, ``"seam"`` or ``"region"``; empty if it was not told
+    #: its items as planned last; those done, used again or not, and those that workers have
     total: int = 0
     done: int = 0
     in_hand: int = 0
-    lost: set[str] = field(default_factory=set)
-    seconds: float = 0.0
-    began: float = 0.0
-    finished: float = 0.0
+    lost: set[str] = field(default_factory=set)  #: items that failed or are not run, of a group with their stages
+    seconds: float = 0.0  #: wall time of all items done (s)
+    began: float = 0.0  #: when its first item was given to a worker (s since 1970); 0 before that
+    finished: float = 0.0  #: when the last item was done (s after the start of the run); 0 before that
+    #: state of its items by name, where its scope has no boxes; those of tiles and seams are in `Items`
     codes: dict[str, int] = field(default_factory=dict)
+    #: number of items in each state but `State.WAITING`, those that are planned no more among them
     counts: Counter[int] = field(default_factory=Counter)
 
     @property

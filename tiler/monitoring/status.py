@@ -25,11 +25,6 @@ COUNTS = ("total", "done", "reused", "running", "failed")
 def read_status(directory: Path) -> dict[str, Any]:
     """Return how far the run in a folder is.
 
-    Parameters
-    ----------
-    directory : Path
-        Folder of a run.
-
     Returns
     -------
     dict

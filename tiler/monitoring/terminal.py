@@ -58,10 +58,9 @@ def print_last_line(record: dict[str, Any], out: Path) -> None:
     print(printable(f"{counts['cells']:,} cells in {out}, {record['seconds_total']:.1f} s{left_out}"))
 
 
-def print_summary(record: dict[str, Any], out: Path, *, console: Console | None = None) -> None:
+def print_summary(record: dict[str, Any], out: Path) -> None:
     """Print what was made, how good it is, what was not taken as it came, and the next commands."""
-    console = console or Console(highlight=False)
-    counts = record["counts"]
+    console, counts = Console(highlight=False), record["counts"]
     console.print(
         f"[bold]{counts['cells']:,}[/] cells, {counts['points']:,} points, {report_buildings(counts)} "
         f"in {record['seconds_total']:.1f} s, peak memory {record['peak_memory_bytes'] / 2**20:.0f} MiB"

@@ -161,17 +161,7 @@ def _event(kind: str, **content: Any) -> Event:
 
 
 def describe_command(start: RunStart, stage: str, scope: Scope, name: str) -> str:
-    """Give the command that shows an item's failure: that of a tile alone, else of the whole run, if it has one.
-
-    Parameters
-    ----------
-    start : RunStart
-        The run.
-    stage, name : str
-        The item.
-    scope : Scope
-        Scope of the stage.
-    """
+    """Give the command that shows an item's failure: of a tile alone, else of the whole run, if it has one."""
     tiles = [name] if scope is Scope.TILE else []
     if scope is Scope.SEAM:
         tiles = [tile_name(key) for key in tiles_of_seam(seam_key(name))]

@@ -75,8 +75,6 @@ def usable_cameras(
     ----------
     cameras : iterator of Camera
         All cameras.
-    images : Path
-        Folder of images.
     low, high : float64 (3,)
         Box of the city (m).
     told : Counter of str

@@ -27,8 +27,6 @@ def read_opensfm(path: Path, origin: Array | None, crs: pyproj.CRS | None, lift:
 
     Parameters
     ----------
-    path : Path
-        The file.
     origin : float64 (3,), optional
         What its coordinates count from in the CRS (m); without it the reference of the file places them.
     crs : pyproj.CRS, optional

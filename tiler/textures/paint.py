@@ -22,27 +22,14 @@ NO_IMAGE = 255
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """A surface with its texels.
+    """A surface with its texels."""
 
-    Attributes
-    ----------
-    pixels : uint8 (h, w, 3)
-        Colours, the first row at the top.
-    rank : uint8 (h, w)
-        Which of its images a texel is of, 0 for the best; `NO_IMAGE` where none shows it.
-    inside : bool (h, w)
-        Whether the middle of a texel is in the surface.
-    texel : float
-        Side of a texel (m).
-    scale : float
-        Pixels of its images per metre, the mean of its texels; 0 where none shows it.
-    """
-
-    pixels: NDArray[np.uint8]
+    pixels: NDArray[np.uint8]  #: (h, w, 3): colours, the first row at the top
+    #: (h, w): which of its images a texel is of, 0 for the best; `NO_IMAGE` where none shows it
     rank: NDArray[np.uint8]
-    inside: NDArray[np.bool_]
-    texel: float
-    scale: float
+    inside: NDArray[np.bool_]  #: (h, w): whether the middle of a texel is in the surface
+    texel: float  #: side of a texel (m)
+    scale: float  #: pixels of its images per metre, the mean of its texels; 0 where none shows it
 
     @property
     def share(self) -> float:

@@ -28,31 +28,16 @@ TEXTURED = (ROOF, WALL, UNKNOWN)
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A wall or roof in the rectangle around it.
+    """A wall or roof in the rectangle around it."""
 
-    Attributes
-    ----------
-    building, face : int
-        Number of its building in the tile, and of the face in its building.
-    kind : int
-        Kind of the face, see `tiler.cityinput.faces`.
-    origin : float64 (3,)
-        Lower left corner of the rectangle (m).
-    axes : float64 (3, 3)
-        Unit vectors: to the right, which is horizontal, up, and outwards.
-    size : float64 (2,)
-        Width and height (m).
-    corners : float64 (t, 3, 3)
-        Its triangles (m).
-    """
-
+    #: number of its building in the tile, and of the face in its building
     building: int
     face: int
-    kind: int
-    origin: Array
-    axes: Array
-    size: Array
-    corners: Array
+    kind: int  #: kind of the face, see `tiler.cityinput.faces`
+    origin: Array  #: (3,): lower left corner of the rectangle (m)
+    axes: Array  #: (3, 3): unit vectors: to the right, which is horizontal, up, and outwards
+    size: Array  #: (2,): width and height (m)
+    corners: Array  #: (t, 3, 3): its triangles (m)
 
     @property
     def area(self) -> float:
@@ -72,27 +57,13 @@ class Tile:
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """Squares of the plane, and files with what is in each.
+    """Squares of the plane, and files with what is in each."""
 
-    Attributes
-    ----------
-    folder : Path
-        Where ``buildings/CODE`` and ``triangles/CODE`` are.
-    side : float
-        Side of a square (m); they begin at multiples of it in the CRS.
-    tiles : list of int
-        Bins with buildings, by the middle of their box, ascending.
-    boxes : dict of int to (float, float, float, float)
-        Box of the triangles of each bin that has some (m).
-    top : float
-        Height of the highest of all (m).
-    """
-
-    folder: Path
-    side: float
-    tiles: list[int]
-    boxes: dict[int, Box]
-    top: float
+    folder: Path  #: where ``buildings/CODE`` and ``triangles/CODE`` are
+    side: float  #: side of a square (m); they begin at multiples of it in the CRS
+    tiles: list[int]  #: bins with buildings, by the middle of their box, ascending
+    boxes: dict[int, Box]  #: box of the triangles of each bin that has some (m)
+    top: float  #: height of the highest of all (m)
 
     def name(self, code: int) -> str:
         """Name a bin by its place: ``i_j``, eastwards and northwards."""

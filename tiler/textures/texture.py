@@ -74,8 +74,6 @@ def texture_models(inputs: Sequence[Path], output: Path, asked: TextureAsked) ->
         As of `tiler.convert.convert.convert_models`; the ground of a run hides, too.
     output : Path
         The folder; it appears whole or not at all.
-    asked : TextureAsked
-        What is asked.
 
     Raises
     ------

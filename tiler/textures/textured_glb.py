@@ -28,8 +28,6 @@ def textured_glb(
 
     Parameters
     ----------
-    tile : Tile
-        Its buildings.
     painted : sequence of Painted or None
         Texels of each surface.
     extras : sequence of dict

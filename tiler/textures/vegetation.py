@@ -33,25 +33,14 @@ FORMAT = "citystitch vegetation 1"
 
 @dataclass(frozen=True, eq=False)
 class Classifier:
-    """Layers of a small network: a patch shows plants where the last value is above 0.
+    """Layers of a small network: a patch shows plants where the last value is above 0."""
 
-    Attributes
-    ----------
-    patch : int
-        Side of a patch (pixels).
-    mean, spread : float64 (f,)
-        Of the features of the training.
-    weights : list of float64 (n, m)
-        Of each layer; between layers negative values become 0.
-    offsets : list of float64 (m,)
-        Of each layer.
-    """
-
-    patch: int
+    patch: int  #: side of a patch (pixels)
+    #: (f,): of the features of the training
     mean: Array
     spread: Array
-    weights: list[Array]
-    offsets: list[Array]
+    weights: list[Array]  #: each (n, m): of each layer; between layers negative values become 0
+    offsets: list[Array]  #: each (m,): of each layer
 
     def shows_plants(self, features: Array) -> NDArray[np.bool_]:
         """Tell of features (n, f) whether they are of plants, (n,)."""

@@ -71,18 +71,10 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Images of each surface of a tile.
+    """Images of each surface of a tile."""
 
-    Attributes
-    ----------
-    best : list of list of int
-        Numbers of the cameras that see it, the best first.
-    reached : list of int
-        The best state of its points in any image, see `tiler.textures.visibility`.
-    """
-
-    best: list[list[int]]
-    reached: list[int]
+    best: list[list[int]]  #: numbers of the cameras that see it, the best first
+    reached: list[int]  #: the best state of its points in any image, see `tiler.textures.visibility`
 
 
 def texel_grid(surface: Surface, texel: float) -> NDArray[np.bool_]:

@@ -116,8 +116,6 @@ def write_town(
     ----------
     directory : Path
         Folder to write to; made if it is missing.
-    town : Town
-        The town.
     output : Output
         Files of houses, of `make_output`; with truth where it is scanned.
     density : float

@@ -75,8 +75,6 @@ def scan_strips(
 
     Parameters
     ----------
-    town : Town
-        The town.
     box : tuple of 4 floats
         West, south, east, north (m); points on the western or southern side are inside.
     houses, trees : sequences
@@ -215,10 +213,10 @@ def describe_truth(house: House) -> dict[str, Any]:
         "ground": house.z,
         "eaves": round(house.z + house.height, 3),
         "ridge": round(house.z + house.height + house.roof.rise, 3),
-        "outline": _ring(house, outline_rings(house)[0], 0.0),
-        "roof_outline": _ring(outer, outline_rings(outer)[0], 0.0),
+        "outline": _ring(house, outline_rings(house)[0]),
+        "roof_outline": _ring(outer, outline_rings(outer)[0]),
         "parts": [
-            {"kind": part.kind, "outline": _ring(house, part_ring(house, part), 0.0), "height": part.height}
+            {"kind": part.kind, "outline": _ring(house, part_ring(house, part)), "height": part.height}
             for part in house.parts
         ],
         "dormers": len(house.dormers),
@@ -228,8 +226,8 @@ def describe_truth(house: House) -> dict[str, Any]:
     }
 
 
-def _ring(house: House, ring: Sequence[tuple[float, float]], z: float) -> list[tuple[float, ...]]:
-    (placed,) = to_town(house, [Surface(FOOT, [(x, y, z) for x, y in ring], [])])
+def _ring(house: House, ring: Sequence[tuple[float, float]]) -> list[tuple[float, ...]]:
+    (placed,) = to_town(house, [Surface(FOOT, [(x, y, 0.0) for x, y in ring], [])])
     return [corner[:2] for corner in placed.border]
 
 

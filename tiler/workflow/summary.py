@@ -9,7 +9,6 @@ import numpy as np
 
 from pipeline.data.notes import Note, count_notes
 from pipeline.points_terrain.terrain_fill import RIM as FAR_NODES
-from pipeline.simplification.house_clusters import add_counts
 from tiler.config.config import Config
 from tiler.config.domain_height import resolve_height
 from tiler.config.zone_levels import describe_zones
@@ -232,7 +231,7 @@ def _join_counts(engine: Engine, plan: Plan, rounds: int, clouds: Mapping[str, F
     """Add up the numbers of all stages."""
     total: Counter[str] = Counter()
     for facts in clouds.values():
-        add_counts(total, {f"points {name}": n for name, n in facts["counts"].items()})
+        total.update({f"points {name}": n for name, n in facts["counts"].items()})
     total["files"] = len(plan.headers)
     total["files empty"] = sum(header.n_points == 0 for header in plan.headers)
     total["tiles"] = len(plan.layout.tiles)
@@ -246,7 +245,7 @@ def _join_counts(engine: Engine, plan: Plan, rounds: int, clouds: Mapping[str, F
             if stage == "pieces":
                 total["facets"] += counts["facets"]
             elif stage != "points":
-                add_counts(total, counts)
+                total.update(counts)
     total["points"] = engine.records["report", REGION_ITEM].facts["points"]
     return dict(total)
 

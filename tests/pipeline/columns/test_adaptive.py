@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
 from pipeline.columns.adaptive import AdaptiveOptions, AdaptiveReport, fill_columns, mesh_adaptive
-from pipeline.columns.columns import expand_cells, extract_boundary, lowest_gap
+from pipeline.columns.columns import expand_cells, lowest_gap
 from pipeline.columns.improve_columns import ColumnSurvey, improve_columns, split_columns
 from pipeline.columns.levels import fill_levels, stagger_columns
 from pipeline.columns.nodes import (
@@ -39,6 +39,7 @@ from pipeline.points_terrain.terrain import HEIGHT_UNIT, Dtm, sample_dtm
 from pipeline.quality.quality import measure_cells, quality_percentiles
 from tests.helpers.cities import Bounds, city_of, crowded_blocks, hilly_dtm, tilted_dtm
 from tests.helpers.terraces import prove_conforming, prove_volume, prove_walls, terrace_town
+from tests.helpers.whole_city import extract_boundary
 
 LIMITS = SpacingLimits(least=0.1, most=0.8)
 OPTIONS = AdaptiveOptions(mesh_size=10.0, domain_height=60.0, limits=LIMITS, stagger=0.8, passes=1)

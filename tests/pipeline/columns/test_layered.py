@@ -8,7 +8,7 @@ import shapely
 
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
-from pipeline.columns.columns import count_cells, expand_cells, extract_boundary, lowest_gap
+from pipeline.columns.columns import count_cells, expand_cells, lowest_gap
 from pipeline.columns.layered import LayeredOptions, Smoother, layer_mesh, mesh_layers
 from pipeline.columns.neighbours import join_equal_roofs, part_neighbours
 from pipeline.columns.trim_layers import count_removed_layers, first_kept, first_levels
@@ -26,6 +26,7 @@ from pipeline.smoothing.repair import repair_columns
 from pipeline.smoothing.stencil import assemble_stencil
 from tests.helpers.cities import Bounds, city_of, hilly_dtm, random_blocks, random_city, tilted_dtm
 from tests.helpers.terraces import prove_conforming, prove_volume, prove_walls, terrace_town
+from tests.helpers.whole_city import extract_boundary
 
 BOUNDS = (318000.0, 6399000.0, 318250.0, 6399250.0)
 OPTIONS = LayeredOptions(

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.columns.adaptive import mesh_adaptive
-from pipeline.columns.columns import expand_cells, extract_boundary, lowest_gap
+from pipeline.columns.columns import expand_cells, lowest_gap
 from pipeline.columns.order_keys import set_order_keys, wall_gates
 from pipeline.data.mesh import ColumnMesh, Marker, PlaneMesh
 from pipeline.data.roofs import roof_heights
 from stitch.pieces.conformity import compute_cell_volumes
 from tests.helpers.sloped_towns import OPTIONS, SlopedTown, sloped_town
 from tests.helpers.terraces import prove_conforming
+from tests.helpers.whole_city import extract_boundary
 from tiler.check.wall_proofs import Walls, check_overlap, measure_walls
 
 

@@ -14,10 +14,9 @@ from pipeline.columns.layered import LayeredOptions
 from pipeline.data.citymodel import Footprints, make_ids, number_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import count_notes
-from pipeline.simplification.simplify import simplify_city
 from tests.helpers.cities import CITY_OPTIONS as OPTIONS
 from tests.helpers.cities import Bounds, cloud_over, tilted_dtm
-from tests.helpers.whole_city import mesh_city
+from tests.helpers.whole_city import mesh_city, simplify_city
 
 BOUNDS: Bounds = (1000.0, 2000.0, 1100.0, 2100.0)
 LAYERS = LayeredOptions(

@@ -39,10 +39,10 @@ pytestmark = pytest.mark.shared
 
 @cache
 def read(path: Path) -> tuple[NDArray[np.object_], NDArray[np.int32]]:
-    # The file's coordinates are metres, whatever CRS it states.
+    """Polygons of a file, in metres whatever CRS it states, and the group of each."""
     meta, _, blobs, fields = pyogrio.raw.read(path)
-    group: NDArray[np.int32] = dict(zip(meta["fields"], fields, strict=True))["group"]
-    return shapely.from_wkb(blobs), group
+    names = dict(zip(meta["fields"], fields, strict=True))
+    return shapely.from_wkb(blobs), names.get("group", np.zeros(len(blobs), np.int32))
 
 
 @pytest.fixture
@@ -50,23 +50,27 @@ def nasty(shared_data: Path) -> tuple[NDArray[np.object_], NDArray[np.int32]]:
     return read(shared_data / "nasty_footprints.geojson")
 
 
-def simplify(polygons: NDArray[np.object_]) -> tuple[Footprints, tuple[Note, ...], MergedFootprints]:
-    ids = np.array([f"{row:03d}" for row in range(len(polygons))], dtype=np.str_)
+def clean(polygons: NDArray[np.object_]) -> tuple[Footprints, tuple[Note, ...]]:
+    ids = np.array([f"{row:04d}" for row in range(len(polygons))], dtype=np.str_)
     rows = Footprints(polygons, ids, np.full(len(polygons), np.nan))
-    clean, notes = clean_footprints(rows, min_area=MIN_AREA, tolerance=TOLERANCE)
+    return clean_footprints(rows, min_area=MIN_AREA, tolerance=TOLERANCE)
+
+
+def simplify(polygons: NDArray[np.object_]) -> tuple[Footprints, tuple[Note, ...], MergedFootprints]:
+    cleaned, notes = clean(polygons)
     merged = merge_footprints(
-        clean.polygons, clearance=CLEARANCE, min_hole_area=MIN_HOLE_AREA, floor=FLOOR, tolerance=TOLERANCE
+        cleaned.polygons, clearance=CLEARANCE, min_hole_area=MIN_HOLE_AREA, floor=FLOOR, tolerance=TOLERANCE
     )
-    return clean, notes, merged
+    return cleaned, notes, merged
 
 
-def assert_promises(clean: Footprints, merged: MergedFootprints) -> None:
+def assert_promises(cleaned: Footprints, merged: MergedFootprints) -> None:
     assert shapely.is_valid(merged.polygons).all()
     assert is_sound(merged.polygons, FLOOR).all()
     distance = shapely.distance(merged.polygons[:, None], merged.polygons[None, :])
     assert (distance[~np.eye(len(distance), dtype=np.bool_)] >= CLEARANCE).all()
     rows = [row for members in merged.members for row in members.tolist()]
-    assert sorted(rows) == list(range(len(clean.ids)))
+    assert sorted(rows) == list(range(len(cleaned.ids)))
 
 
 def assert_nothing_lost(given: NDArray[np.object_], notes: tuple[Note, ...], merged: MergedFootprints) -> None:
@@ -76,43 +80,22 @@ def assert_nothing_lost(given: NDArray[np.object_], notes: tuple[Note, ...], mer
     for row, geometry in enumerate(given):
         for part in shapely.get_parts(shapely.make_valid(geometry, method="structure")):
             covered = city.distance(part.representative_point()) < FLOOR
-            assert covered or f"{row:03d}" in gone, f"footprint {row}: {part.wkt[:200]}"
+            assert covered or f"{row:04d}" in gone, f"footprint {row}: {part.wkt[:200]}"
 
 
 @pytest.mark.parametrize("number", GROUPS)
-def test_a_group_becomes_sound_and_keeps_its_buildings(
+def test_a_group_becomes_sound_keeps_its_buildings_and_is_meshed(
     number: int, nasty: tuple[NDArray[np.object_], NDArray[np.int32]]
 ) -> None:
+    """Steps 2.1 and 3.1, and the volume over the plane: nothing is inverted."""
     polygons = nasty[0][nasty[1] == number]
-    clean, notes, merged = simplify(polygons)
-    assert_promises(clean, merged)
+    cleaned, notes, merged = simplify(polygons)
+    assert_promises(cleaned, merged)
     assert_nothing_lost(polygons, notes, merged)
     # What merging covers, each building keeps but for the margins of the repairs.
-    assert merged_area_lost(clean, merged) <= FLOOR * shapely.length(clean.polygons).sum()
-
-
-def merged_area_lost(clean: Footprints, merged: MergedFootprints) -> float:
-    return float(shapely.union_all(clean.polygons).difference(shapely.union_all(merged.polygons)).area)
-
-
-def test_the_groups_are_those_of_the_file(nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
-    assert np.unique(nasty[1]).tolist() == GROUPS
-    assert len(nasty[0]) == 352
-
-
-def test_all_groups_together_merge_as_they_do_alone(nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
-    clean, notes, merged = simplify(nasty[0])
-    assert_promises(clean, merged)
-    assert_nothing_lost(nasty[0], notes, merged)
-    alone = [simplify(nasty[0][nasty[1] == number])[2].polygons for number in GROUPS]
-    assert set(shapely.to_wkb(np.concatenate(alone))) == set(shapely.to_wkb(merged.polygons))
-
-
-@pytest.mark.parametrize("number", GROUPS)
-def test_a_group_is_meshed(number: int, nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
-    """Step 3.1 on what 2.1 makes of the group, and the volume over it: nothing is inverted."""
-    _, _, merged = simplify(nasty[0][nasty[1] == number])
-    box = shapely.total_bounds(nasty[0][nasty[1] == number])
+    lost = shapely.union_all(cleaned.polygons).difference(shapely.union_all(merged.polygons)).area
+    assert lost <= FLOOR * shapely.length(cleaned.polygons).sum()
+    box = shapely.total_bounds(polygons)
     bounds = (float(box[0]) - 30, float(box[1]) - 30, float(box[2]) + 30, float(box[3]) + 30)
     plane, complete = mesh_plane(bounds, merged.polygons, mesh_size=10.0)
     assert complete
@@ -125,3 +108,16 @@ def test_a_group_is_meshed(number: int, nasty: tuple[NDArray[np.object_], NDArra
     options = LayeredOptions(10.0, 10.0, 100.0 + float(roofed.roof.max(initial=0)), "columns", 0.003, 1e-8)
     columns, _ = mesh_layers(plane, dtm, roofed, wall_ground, bounds, options)
     assert lowest_gap(columns)[1] == 0
+
+
+def test_the_groups_are_those_of_the_file(nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
+    assert np.unique(nasty[1]).tolist() == GROUPS
+    assert len(nasty[0]) == 352
+
+
+def test_all_groups_together_merge_as_they_do_alone(nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
+    cleaned, notes, merged = simplify(nasty[0])
+    assert_promises(cleaned, merged)
+    assert_nothing_lost(nasty[0], notes, merged)
+    alone = [simplify(nasty[0][nasty[1] == number])[2].polygons for number in GROUPS]
+    assert set(shapely.to_wkb(np.concatenate(alone))) == set(shapely.to_wkb(merged.polygons))

@@ -1,6 +1,7 @@
 """The planar city model: hand-worked streets, fallbacks, and promises on random ones, checked by brute force."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,26 +16,49 @@ import pipeline.simplification.shaping
 import pipeline.simplification.snap
 from pipeline.data.errors import GeometryError
 from pipeline.data.roofs import Roofs, flat_roofs, join_roofs
+from pipeline.geometry.components import join_pairs
+from pipeline.roofs.house_levels import HouseParts
 from pipeline.simplification.fidelity import FARTHEST, measure_moved_roofs, measure_simplification
 from pipeline.simplification.graph import WallGraph, find_near, make_graph, node_walls, trace_faces
+from pipeline.simplification.house_clusters import find_close
 from pipeline.simplification.labels import Territories
-from pipeline.simplification.planar import COUNTS, PlanarCity, find_clusters, shape_planar, simplify_planar
+from pipeline.simplification.planar import COUNTS, PlanarCity, shape_planar
 from pipeline.simplification.shaping import Shaped
-from pipeline.simplification.snap import node_crossings, straighten
+from pipeline.simplification.snap import CHAIN_TOLERANCE, node_crossings, straighten
 from pipeline.simplification.square_cells import draw_cells
 from tests.helpers.campaigns import examples
+from tests.helpers.cities import CITY_OPTIONS
+from tests.helpers.whole_city import simplify_houses
 
 EPS, MIN_AREA, MIN_COURTYARD = 0.5, 5.0, 5.0
 
 
 def simplify(*polygons: Polygon, clearance: float = EPS, manifold: bool = False) -> PlanarCity:
-    return simplify_planar(
-        np.array(polygons, dtype=object),
-        clearance=clearance,
-        min_area=MIN_AREA,
-        min_courtyard_area=MIN_COURTYARD,
-        manifold=manifold,
-    )
+    return shape_joined(np.array(polygons, dtype=object), clearance=clearance, manifold=manifold)[0]
+
+
+def shape_joined(
+    houses: NDArray[np.object_], *, clearance: float, manifold: bool = False
+) -> tuple[PlanarCity, NDArray[np.int64]]:
+    """Shape clusters of close houses, joined until their results are apart; give the clusters too."""
+    cluster = find_clusters(houses, clearance)
+    while True:
+        city = shape_planar(
+            houses,
+            cluster,
+            clearance=clearance,
+            min_area=MIN_AREA,
+            min_courtyard_area=MIN_COURTYARD,
+            manifold=manifold,
+        )
+        joined = join_pairs(len(houses), cluster[city.house][find_close(city.polygons, clearance)])[cluster]
+        if (joined == cluster).all():
+            return city, cluster
+        cluster = joined
+
+
+def find_clusters(houses: NDArray[np.object_], clearance: float) -> NDArray[np.int64]:
+    return join_pairs(len(houses), find_close(houses, clearance))
 
 
 def test_near_vertices_are_the_pairs_of_one_cluster_that_are_closer_than_the_bound() -> None:
@@ -111,7 +135,7 @@ def test_a_gap_of_the_clearance_stays() -> None:
     city = simplify(box(0, 0, 4, 4), box(4.5, 0, 9, 4), box(9.499, 0, 14, 4))
     assert shapes(city)[0] == ["POLYGON ((0 0, 4 0, 4 4, 0 4, 0 0))"]
     assert shapely.distance(city.polygons[city.house == 1], city.polygons[city.house == 2]) == 0
-    assert city.cluster.tolist() == [0, 1, 1]
+    assert city.counts["clusters"] == 2
 
 
 def test_a_corner_on_a_wall_is_a_vertex_of_both_houses() -> None:
@@ -164,7 +188,7 @@ def test_a_house_in_a_light_shaft_is_not_swallowed() -> None:
     # The shaft has 4 m2 less the house: it would be filled, and the house with it, were they not taken together.
     outer = box(0, 0, 12, 12).difference(box(5, 5, 7.1, 7.1))
     city = simplify(outer, box(5.6, 5.6, 6.5, 6.5), clearance=0.4)
-    assert city.counts["clusters-joined"] == 1
+    assert city.counts["clusters"] == 1
     assert set(city.house.tolist()) == {0, 1}
     assert_promises(city, 0.4)
 
@@ -279,10 +303,13 @@ def test_clusters_whose_results_come_too_close_are_taken_together() -> None:
     # The dent of 8 cm is straightened away, towards the tip that is 0.52 m from it.
     dented = Polygon([(0, 0), (10, 0), (9.92, 5), (10, 10), (0, 10)])
     tip = Polygon([(10.44, 5), (13, 2), (16, 5), (13, 8)])
-    assert find_clusters(np.array([dented, tip]), EPS).tolist() == [0, 1]
-    city = simplify(dented, tip)
-    assert (city.counts["clusters-joined"], city.counts["clusters"], city.cluster.tolist()) == (1, 1, [0, 0])
-    assert_promises(city, EPS)
+    pair = np.array([dented, tip], dtype=object)
+    assert find_clusters(pair, EPS).tolist() == [0, 1]
+    parts = HouseParts(pair, np.arange(2))
+    shapes = simplify_houses(parts, pair, replace(CITY_OPTIONS, simplify="clearance", clearance=EPS))
+    assert (shapes.counts["clusters joined"], shapes.cluster.tolist()) == (1, [0, 0])
+    assert shapely.to_wkb(shapes.polygons).tolist() == shapely.to_wkb(simplify(dented, tip).polygons).tolist()
+    assert_promises(simplify(dented, tip), EPS)
 
 
 @pytest.mark.parametrize("manifold", [False, True])
@@ -302,8 +329,8 @@ def test_walls_that_do_not_settle_are_drawn_with_cells(manifold: bool, monkeypat
 def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch: pytest.MonkeyPatch) -> None:
     settle = pipeline.simplification.snap.settle
 
-    def fail(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
-        settled, restless, counts = settle(graph, clearance=clearance, chain_tolerance=chain_tolerance)
+    def fail(graph: WallGraph, clearance: float) -> object:
+        settled, restless, counts = settle(graph, clearance)
         return settled, np.unique(graph.cluster[graph.xy[:, 0] < 20000]) if clearance == 500 else restless, counts
 
     monkeypatch.setattr(pipeline.simplification.shaping, "settle", fail)
@@ -318,8 +345,8 @@ def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch:
     ids=["two corners", "a corner and a wall"],
 )
 def test_the_check_believes_no_round(other: Polygon, monkeypatch: pytest.MonkeyPatch) -> None:
-    def claim(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
-        assert clearance > chain_tolerance
+    def claim(graph: WallGraph, clearance: float) -> object:
+        assert clearance > CHAIN_TOLERANCE
         return graph, np.zeros(0, np.int64), Counter({"rounds": 1})
 
     monkeypatch.setattr(pipeline.simplification.shaping, "settle", claim)
@@ -411,12 +438,12 @@ def test_polygons_that_are_none_are_refused(broken: shapely.Geometry) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"clearance": 0.0}, {"chain_tolerance": 0.6}, {"min_area": -1.0}, {"min_courtyard_area": float("nan")}],
+    [{"clearance": 0.0}, {"clearance": 0.09}, {"min_area": -1.0}, {"min_courtyard_area": float("nan")}],
 )
 def test_wrong_arguments_are_refused(wrong: dict[str, float]) -> None:
-    right = {"clearance": EPS, "chain_tolerance": 0.1, "min_area": 5.0, "min_courtyard_area": 5.0}
-    with pytest.raises(ValueError, match=r"want 0\.01 <= clearance"):
-        simplify_planar(np.array([box(0, 0, 4, 4)]), **(right | wrong))  # type: ignore[arg-type]
+    right = {"clearance": EPS, "min_area": 5.0, "min_courtyard_area": 5.0}
+    with pytest.raises(ValueError, match=r"want 0\.1 <= clearance"):
+        shape_planar(np.array([box(0, 0, 4, 4)]), np.zeros(1, np.int64), **(right | wrong))  # type: ignore[arg-type]
 
 
 def test_measures_are_those_of_the_areas() -> None:
@@ -449,7 +476,7 @@ def streets(draw: st.DrawFn) -> list[Polygon]:
 def test_promises_hold_for_any_street_in_any_order(
     houses: list[Polygon], clearance: float, manifold: bool, shuffler: object
 ) -> None:
-    city = simplify(*houses, clearance=clearance, manifold=manifold)
+    city, clusters = shape_joined(np.array(houses, dtype=object), clearance=clearance, manifold=manifold)
     assert_promises(city, clearance)
     found = measure_simplification(np.array(houses), city.polygons, city.house)
     assert found.corner_touches == city.counts["corner-touches"]
@@ -459,7 +486,7 @@ def test_promises_hold_for_any_street_in_any_order(
     shuffler.shuffle(again)  # type: ignore[attr-defined]
     assert blobs(simplify(*again, clearance=clearance, manifold=manifold)) == blobs(city)
     alone = []
-    for name in np.unique(city.cluster):
-        members = [house for house, cluster in zip(houses, city.cluster, strict=True) if cluster == name]
+    for name in np.unique(clusters):
+        members = [house for house, cluster in zip(houses, clusters, strict=True) if cluster == name]
         alone += blobs(simplify(*members, clearance=clearance, manifold=manifold))
     assert sorted(alone) == sorted(blobs(city))

@@ -1,33 +1,27 @@
 """The planar city model on difficult ground: random messes, difficult real footprints, all of Amsterdam."""
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pyogrio
 import pytest
 import shapely
 from numpy.typing import NDArray
 from shapely import Polygon, affinity, box
 
-from pipeline.city_model.footprints import clean_footprints
-from pipeline.data.citymodel import Footprints
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.simplification.fidelity import measure_simplification
-from pipeline.simplification.planar import PlanarCity, simplify_planar
+from pipeline.simplification.planar import PlanarCity
 from tests.helpers.campaigns import rounds
-from tests.pipeline.simplification.test_planar import assert_promises, blobs
+from tests.pipeline.simplification.test_nasty_footprints import GROUPS, clean, read
+from tests.pipeline.simplification.test_planar import (
+    MIN_COURTYARD,
+    assert_promises,
+    blobs,
+    shape_joined,
+    simplify,
+)
 
-MIN_AREA, TOLERANCE, MIN_COURTYARD = 5.0, 0.01, 5.0
 MESH_SIZE, MARGIN = 10.0, 10.0
-# The group numbers of the file; gaps in them are as published.
-GROUPS = [*range(1, 20), *range(57, 99), *range(141, 189), *range(199, 214)]
-
-
-def simplify(polygons: NDArray[np.object_], clearance: float, *, manifold: bool = False) -> PlanarCity:
-    return simplify_planar(
-        polygons, clearance=clearance, min_area=MIN_AREA, min_courtyard_area=MIN_COURTYARD, manifold=manifold
-    )
 
 
 def assert_meshes(city: PlanarCity) -> NDArray[np.float64]:
@@ -109,7 +103,7 @@ def mess(seed: int) -> NDArray[np.object_]:
 def test_promises_hold_for_any_mess(seed: int) -> None:
     polygons = mess(seed)
     clearance, manifold = (0.25, 0.5, 1.0, 2.0)[seed % 4], seed % 3 == 0
-    city = simplify(polygons, clearance, manifold=manifold)
+    city = simplify(*polygons, clearance=clearance, manifold=manifold)
     assert_promises(city, clearance)
     assert not (manifold and city.counts["corner-touches"])
     # The street is not swallowed: what is built anew is a seam along walls, or a light shaft.
@@ -123,26 +117,13 @@ def test_promises_hold_for_any_mess(seed: int) -> None:
         assert assert_meshes(city).min() >= min(8.0, 0.5 * sharpest)
 
 
-@cache
-def read(path: Path) -> tuple[NDArray[np.object_], NDArray[np.int32]]:
-    meta, _, blob, fields = pyogrio.raw.read(path)
-    names = dict(zip(meta["fields"], fields, strict=True))
-    return shapely.from_wkb(blob), names.get("group", np.zeros(len(blob), np.int32))
-
-
-def clean(polygons: NDArray[np.object_]) -> NDArray[np.object_]:
-    ids = np.array([f"{row:04d}" for row in range(len(polygons))], dtype=np.str_)
-    rows = Footprints(polygons, ids, np.full(len(polygons), np.nan))
-    return clean_footprints(rows, min_area=MIN_AREA, tolerance=TOLERANCE)[0].polygons
-
-
 @pytest.mark.shared
 @pytest.mark.parametrize("number", GROUPS)
 def test_a_group_of_difficult_footprints_keeps_the_promises(number: int, shared_data: Path) -> None:
     polygons, group = read(shared_data / "nasty_footprints.geojson")
-    houses = clean(polygons[group == number])
+    houses = clean(polygons[group == number])[0].polygons
     for clearance in (0.5, 1.0):
-        city = simplify(houses, clearance)
+        city = simplify(*houses, clearance=clearance)
         assert_promises(city, clearance)
         assert set(city.method) <= {"snapped"}
         found = measure_simplification(houses, city.polygons, city.house)
@@ -157,14 +138,14 @@ def test_a_group_of_difficult_footprints_keeps_the_promises(number: int, shared_
 
 @pytest.fixture(scope="module")
 def amsterdam(shared_data: Path) -> NDArray[np.object_]:
-    return clean(read(shared_data / "amsterdam" / "footprints.gpkg")[0])
+    return clean(read(shared_data / "amsterdam" / "footprints.gpkg")[0])[0].polygons
 
 
 @pytest.mark.shared
 @pytest.mark.parametrize(("clearance", "error"), [(0.5, 0.003), (1.0, 0.008)])
 def test_amsterdam_keeps_its_houses(clearance: float, error: float, amsterdam: NDArray[np.object_]) -> None:
     assert len(amsterdam) == 1475
-    city = simplify(amsterdam, clearance)
+    city = simplify(*amsterdam, clearance=clearance)
     found = measure_simplification(amsterdam, city.polygons, city.house)
     assert found.lost == ()
     assert found.area_error <= error
@@ -178,7 +159,7 @@ def test_amsterdam_keeps_its_houses(clearance: float, error: float, amsterdam: N
 
 @pytest.mark.shared
 def test_amsterdam_without_touching_corners(amsterdam: NDArray[np.object_]) -> None:
-    city = simplify(amsterdam, 0.5, manifold=True)
+    city = simplify(*amsterdam, clearance=0.5, manifold=True)
     found = measure_simplification(amsterdam, city.polygons, city.house)
     assert found.corner_touches == 0 < city.counts["opened"]
     assert set(city.method) == {"snapped"}
@@ -191,10 +172,10 @@ def test_amsterdam_is_the_same_shuffled_and_cluster_by_cluster(amsterdam: NDArra
     middle = shapely.get_coordinates(shapely.centroid(amsterdam))
     houses = amsterdam[(middle < np.median(middle, axis=0)).all(axis=1)]
     assert len(houses) > 250
-    city = simplify(houses, 0.5)
+    city, cluster = shape_joined(houses, clearance=0.5)
     order = np.random.default_rng(3).permutation(len(houses))
-    shuffled = simplify(houses[order], 0.5)
+    shuffled = simplify(*houses[order], clearance=0.5)
     assert blobs(shuffled) == blobs(city)
     assert np.array_equal(order[shuffled.house], city.house)
-    alone = [simplify(houses[city.cluster == name], 0.5) for name in np.unique(city.cluster)]
+    alone = [simplify(*houses[cluster == name], clearance=0.5) for name in np.unique(cluster)]
     assert sorted(pair for part in alone for pair in blobs(part)) == sorted(blobs(city))

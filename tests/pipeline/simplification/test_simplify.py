@@ -11,7 +11,7 @@ from pipeline.city_model.city import City
 from pipeline.city_model.city_steps import build_city
 from pipeline.city_model.heights import Heights
 from pipeline.columns.adaptive import AdaptiveOptions
-from pipeline.columns.columns import expand_cells, extract_boundary
+from pipeline.columns.columns import expand_cells
 from pipeline.columns.layered import LayeredOptions
 from pipeline.columns.spacing import SpacingLimits
 from pipeline.data.citymodel import Footprints
@@ -23,10 +23,10 @@ from pipeline.data.roof_forms import HEIGHT, POINTS_TELL, ROOF_SHAPES, SHAPE, no
 from pipeline.data.roofs import ROOF_FALLBACKS, ROOF_METHODS
 from pipeline.quality.building_facts import describe_buildings, measure_model
 from pipeline.simplification.house_clusters import Shapes
-from pipeline.simplification.simplify import _settle_clusters, settle_roofs, simplify_city
+from pipeline.simplification.simplify import _settle_clusters, settle_roofs
 from tests.helpers.cities import CITY_OPTIONS as OPTIONS
 from tests.helpers.cities import cloud_over, tilted_dtm
-from tests.helpers.whole_city import mesh_city
+from tests.helpers.whole_city import extract_boundary, mesh_city, simplify_city
 from tests.pipeline.columns.test_tile import BOUNDS, LAYERS, footprints_of
 
 PLANAR = dataclasses.replace(OPTIONS, simplify="clearance", roof_percentile=50.0, min_courtyard_area=5.0)

@@ -13,12 +13,13 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.columns.adaptive import mesh_adaptive
-from pipeline.columns.columns import expand_cells, extract_boundary
+from pipeline.columns.columns import expand_cells
 from pipeline.data.mesh import ColumnMesh, Marker
 from pipeline.data.roofs import Roofs
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 from tests.helpers.meshes import PlaneDtm, TinyCity, edit_json, write_run
 from tests.helpers.sloped_towns import BOUNDS, OPTIONS, SlopedTown, sloped_town
+from tests.helpers.whole_city import extract_boundary
 from tiler.check.check import CheckReport, check_run
 from tiler.check.roof_proofs import are_above_roofs
 from tiler.check.solid_proofs import check_solids, read_outlines

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.bad_input import QUICK, call, write_city
+from tests.helpers.bad_input import call, quick_run, write_city
 from tiler.cli.main import main
 from tiler.words.std_streams import _PatientWriter
 
@@ -108,15 +108,7 @@ def run_into_nothing(*words: str | Path, **environment: str) -> tuple[int, str]:
 
 def test_a_reader_that_has_gone_changes_no_exit_code(tmp_path: Path) -> None:
     city = write_city(tmp_path / "city")
-    command: list[str | Path] = [
-        "run",
-        city / "cloud.laz",
-        "--footprints",
-        city / "house.gpkg",
-        "--out",
-        tmp_path / "out",
-        *QUICK,
-    ]
+    command = quick_run(city, tmp_path / "out")
     assert run_into_nothing(*command) == (0, "")
     assert run_into_nothing("check", tmp_path / "out") == (0, "")
     assert run_into_nothing("config") == (0, "")
@@ -128,15 +120,7 @@ def test_a_reader_that_has_gone_changes_no_exit_code(tmp_path: Path) -> None:
 def test_an_ascii_terminal_changes_no_exit_code(tmp_path: Path) -> None:
     city = write_city(tmp_path / "city")
     out = tmp_path / "ausgabe für ß"
-    command: list[str | Path] = [
-        "run",
-        city / "cloud.laz",
-        "--footprints",
-        city / "house.gpkg",
-        "--out",
-        out,
-        *QUICK,
-    ]
+    command = quick_run(city, out)
     for words in (command, ["check", out], ["status", out], ["run", "--help"]):
         process = subprocess.run(
             [*PROGRAM, *map(str, words)],

@@ -1,7 +1,6 @@
 """Deliveries whose records need care: feet, heights in feet beside metres, Web Mercator, old key points."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import CityError
 from tests.helpers.deliveries import FEET, SURVEY_FEET, Delivery
-from tests.tiler.georeference.test_deliveries import ASPRS, NO_ROOFS, assert_right, run_delivery
+from tests.tiler.georeference.test_deliveries import ASPRS, NO_ROOFS, assert_right, las_1_2, run_delivery
 
 
 def thin_to_key_points(las: laspy.LasData, what: NDArray[np.str_]) -> None:
@@ -54,23 +53,11 @@ IN_FEET = {
     "heights-alone-wkt": Delivery(
         NO_ROOFS, crs="EPSG:6347+6360", corner=(323000, 4306000), record="wkt1", unit_z=SURVEY_FEET
     ),
-    "heights-alone-code": Delivery(
+    "heights-alone-code": las_1_2(NO_ROOFS, 26918, (323000, 4306000), heights=6360, unit_z=SURVEY_FEET),
+    "heights-alone-unit": las_1_2(
         NO_ROOFS,
-        point_format=1,
-        version="1.2",
-        crs="EPSG:26918",
-        corner=(323000, 4306000),
-        record="keys",
-        keys={1024: 1, 3072: 26918, 4096: 6360},
-        unit_z=SURVEY_FEET,
-    ),
-    "heights-alone-unit": Delivery(
-        NO_ROOFS,
-        point_format=1,
-        version="1.2",
-        crs="EPSG:26918",
-        corner=(323000, 4306000),
-        record="keys",
+        26918,
+        (323000, 4306000),
         keys={1024: 1, 3072: 26918, 4096: 5703, 4099: 9003},
         unit_z=SURVEY_FEET,
     ),
@@ -113,14 +100,5 @@ def test_web_mercator_is_taken_to_the_utm_zone_that_is_asked_for(tmp_path: Path)
 @pytest.mark.parametrize("edit", [thin_to_key_points, only_key_points])
 def test_key_points_are_ground_in_las_1_2(edit: object, tmp_path: Path) -> None:
     """Catalonia and others deliver them; a model of key points alone is all the ground that there is."""
-    delivery = Delivery(
-        ASPRS,
-        point_format=1,
-        version="1.2",
-        crs="EPSG:25831",
-        corner=(430000, 4582000),
-        record="keys",
-        keys={1024: 1, 3072: 25831},
-    )
-    run_delivery(replace(delivery, edit=edit), tmp_path)  # type: ignore[arg-type]
+    run_delivery(las_1_2(ASPRS, 25831, (430000, 4582000), edit=edit), tmp_path)
     assert_right(tmp_path)
