@@ -33,7 +33,9 @@ MAX_PASSES = 6
 class Rules:
     """What `shape_clusters` has to keep."""
 
-    clearance: float  #: least distance (mm), see `pipeline.simplification.snap.settle`
+    #: lengths (mm), see `pipeline.simplification.snap.settle`
+    clearance: float
+    chain_tolerance: float
     #: areas (mm²), see `pipeline.simplification.labels.drop_small_faces`
     min_area: float
     min_courtyard_area: float
@@ -150,7 +152,7 @@ def _run_passes(
     outcomes = []
     restless = [np.zeros(0, np.int64)]
     for last in [False] * (MAX_PASSES - 1) + [True]:
-        graph, unsettled, done = settle(graph, rules.clearance)
+        graph, unsettled, done = settle(graph, clearance=rules.clearance, chain_tolerance=rules.chain_tolerance)
         add_counts(counts, done)
         restless.append(unsettled)
         graph = graph.keep(~np.isin(graph.edge_clusters(), unsettled))

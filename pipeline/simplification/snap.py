@@ -24,13 +24,12 @@ MAX_ROUNDS = 40
 LONG_WALL = 10_000.0
 # A vertex closer than this (mm) to the line between its neighbours is on it: coordinates are whole millimetres.
 STRAIGHT = 1.5
-# A vertex of two walls goes if that moves no wall farther than this from where it was noded (mm). 200 saves 1 % of
-# the walls more and costs a tenth of the area error more.
-CHAIN_TOLERANCE = 100.0
 Step = tuple[WallGraph, NDArray[np.int64]]
 
 
-def settle(graph: WallGraph, clearance: float) -> tuple[WallGraph, NDArray[np.int64], Counter[str]]:
+def settle(
+    graph: WallGraph, *, clearance: float, chain_tolerance: float
+) -> tuple[WallGraph, NDArray[np.int64], Counter[str]]:
     """Simplify and snap walls until no two features are closer than the clearance.
 
     Parameters
@@ -39,6 +38,8 @@ def settle(graph: WallGraph, clearance: float) -> tuple[WallGraph, NDArray[np.in
         Noded walls.
     clearance : float
         Least distance of two vertices, and of a vertex and an edge that does not end in it (mm).
+    chain_tolerance : float
+        A vertex of two walls goes if that moves no wall farther than this from where it was noded (mm).
 
     Returns
     -------
@@ -61,7 +62,7 @@ def settle(graph: WallGraph, clearance: float) -> tuple[WallGraph, NDArray[np.in
     one by one gives the same bits.
     """
     steps: tuple[tuple[str, Callable[[WallGraph, float], Step], float], ...] = (
-        ("straightened", straighten, CHAIN_TOLERANCE),
+        ("straightened", straighten, chain_tolerance),
         ("collapsed", collapse, clearance),
         ("contracted", contract, clearance),
         ("bent", bend, clearance),

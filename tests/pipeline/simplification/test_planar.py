@@ -24,7 +24,7 @@ from pipeline.simplification.house_clusters import find_close
 from pipeline.simplification.labels import Territories
 from pipeline.simplification.planar import COUNTS, PlanarCity, shape_planar
 from pipeline.simplification.shaping import Shaped
-from pipeline.simplification.snap import CHAIN_TOLERANCE, node_crossings, straighten
+from pipeline.simplification.snap import node_crossings, straighten
 from pipeline.simplification.square_cells import draw_cells
 from tests.helpers.campaigns import examples
 from tests.helpers.cities import CITY_OPTIONS
@@ -329,8 +329,8 @@ def test_walls_that_do_not_settle_are_drawn_with_cells(manifold: bool, monkeypat
 def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch: pytest.MonkeyPatch) -> None:
     settle = pipeline.simplification.snap.settle
 
-    def fail(graph: WallGraph, clearance: float) -> object:
-        settled, restless, counts = settle(graph, clearance)
+    def fail(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
+        settled, restless, counts = settle(graph, clearance=clearance, chain_tolerance=chain_tolerance)
         return settled, np.unique(graph.cluster[graph.xy[:, 0] < 20000]) if clearance == 500 else restless, counts
 
     monkeypatch.setattr(pipeline.simplification.shaping, "settle", fail)
@@ -345,8 +345,8 @@ def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch:
     ids=["two corners", "a corner and a wall"],
 )
 def test_the_check_believes_no_round(other: Polygon, monkeypatch: pytest.MonkeyPatch) -> None:
-    def claim(graph: WallGraph, clearance: float) -> object:
-        assert clearance > CHAIN_TOLERANCE
+    def claim(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
+        assert clearance > chain_tolerance
         return graph, np.zeros(0, np.int64), Counter({"rounds": 1})
 
     monkeypatch.setattr(pipeline.simplification.shaping, "settle", claim)
