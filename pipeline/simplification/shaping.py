@@ -40,6 +40,7 @@ class Rules:
     min_area: float
     min_courtyard_area: float
     manifold: bool  #: whether corners in which houses only touch are opened or closed
+    least_moved: bool = False  #: whether the walls that stay are those that others reach over least ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,12 @@ def _run_passes(
     outcomes = []
     restless = [np.zeros(0, np.int64)]
     for last in [False] * (MAX_PASSES - 1) + [True]:
-        graph, unsettled, done = settle(graph, clearance=rules.clearance, chain_tolerance=rules.chain_tolerance)
+        graph, unsettled, done = settle(
+            graph,
+            clearance=rules.clearance,
+            chain_tolerance=rules.chain_tolerance,
+            least_moved=rules.least_moved,
+        )
         add_counts(counts, done)
         restless.append(unsettled)
         graph = graph.keep(~np.isin(graph.edge_clusters(), unsettled))

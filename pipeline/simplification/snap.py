@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import shapely
@@ -28,7 +29,7 @@ Step = tuple[WallGraph, NDArray[np.int64]]
 
 
 def settle(
-    graph: WallGraph, *, clearance: float, chain_tolerance: float
+    graph: WallGraph, *, clearance: float, chain_tolerance: float, least_moved: bool = False
 ) -> tuple[WallGraph, NDArray[np.int64], Counter[str]]:
     """Simplify and snap walls until no two features are closer than the clearance.
 
@@ -40,6 +41,9 @@ def settle(
         Least distance of two vertices, and of a vertex and an edge that does not end in it (mm).
     chain_tolerance : float
         A vertex of two walls goes if that moves no wall farther than this from where it was noded (mm).
+    least_moved : bool
+        Of vertices that are united, the one stays whose move would take its walls over most ground, not the one
+        of the longest walls and the sharpest turn.
 
     Returns
     -------
@@ -63,8 +67,8 @@ def settle(
     """
     steps: tuple[tuple[str, Callable[[WallGraph, float], Step], float], ...] = (
         ("straightened", straighten, chain_tolerance),
-        ("collapsed", collapse, clearance),
-        ("contracted", contract, clearance),
+        ("collapsed", partial(collapse, least_moved=least_moved), clearance),
+        ("contracted", partial(contract, least_moved=least_moved), clearance),
         ("bent", bend, clearance),
     )
     done, counts = [], Counter[str]()
@@ -106,11 +110,15 @@ def straighten(graph: WallGraph, tolerance: float) -> Step:
         graph = make_graph(graph.xy, graph.cluster, edges, slacks)
 
 
-def collapse(graph: WallGraph, clearance: float) -> Step:
+def collapse(graph: WallGraph, clearance: float, *, least_moved: bool = False) -> Step:
     """Unite the vertices closer than the clearance with the most important one around."""
     (i, j), distance = find_near(graph, clearance)
     i, j, distance = np.concatenate((i, j)), np.concatenate((j, i)), np.tile(distance, 2)
     rank = _rank(graph)
+    if least_moved:
+        passed = np.full(len(rank), np.inf)
+        np.minimum.at(passed, i, _measure_passed(graph, i, j))
+        rank[np.lexsort((rank, -passed))] = np.arange(len(rank))
     state = _choose_keepers(rank, i, j)
     target = np.arange(len(graph.xy))
     leads = state[i] & ~state[j]
@@ -121,7 +129,7 @@ def collapse(graph: WallGraph, clearance: float) -> Step:
     return _unite_vertices(graph, target), graph.cluster[follower]
 
 
-def contract(graph: WallGraph, clearance: float) -> Step:
+def contract(graph: WallGraph, clearance: float, *, least_moved: bool = False) -> Step:
     """Unite vertices with the end of a close edge where bending would only turn a thin triangle over."""
     (vertex, edge), _ = find_close(graph, clearance)
     flips = ~_shortens(graph, vertex, edge)
@@ -138,8 +146,12 @@ def contract(graph: WallGraph, clearance: float) -> Step:
     mine = (first[low] == np.arange(len(low))) & (first[high] == np.arange(len(low)))
     low, high = low[mine], high[mine]
     rank = _rank(graph)
+    stays = rank[low] < rank[high]
+    if least_moved:
+        passed = _measure_passed(graph, low, high) - _measure_passed(graph, high, low)
+        stays = np.where(passed == 0, stays, passed > 0)
     target = np.arange(len(graph.xy))
-    target[np.where(rank[low] < rank[high], high, low)] = np.where(rank[low] < rank[high], low, high)
+    target[np.where(stays, high, low)] = np.where(stays, low, high)
     return _unite_vertices(graph, target), graph.cluster[low]
 
 
@@ -191,6 +203,18 @@ def _rank(graph: WallGraph) -> NDArray[np.int64]:
     rank = np.empty(len(weight), np.int64)
     rank[np.lexsort((np.arange(len(weight)), -weight))] = np.arange(len(weight))
     return rank
+
+
+def _measure_passed(graph: WallGraph, vertex: NDArray[np.int64], goal: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Measure the ground (mm²) that the walls of each vertex pass over if it moves to another one."""
+    order = np.argsort(graph.edges.reshape(-1), kind="stable")
+    far, degree = graph.edges[:, ::-1].reshape(-1)[order], graph.degrees()
+    count = degree[vertex]
+    of = np.repeat(np.arange(len(vertex)), count)
+    first = (np.cumsum(degree) - degree)[vertex] - (np.cumsum(count) - count)
+    wall = graph.xy[far[first[of] + np.arange(len(of))]] - graph.xy[vertex][of]
+    area: NDArray[np.float64] = np.abs(_cross((graph.xy[goal] - graph.xy[vertex])[of], wall)) / 2
+    return np.bincount(of, area, len(vertex)).astype(np.float64)
 
 
 def _choose_keepers(rank: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -124,9 +124,7 @@ def _sample_roofs(rows: ModelRows) -> Array:
     xy = np.asarray((node + 0.5) * STEP, np.float64)
     z = plane_heights(rows.roofs, surface, xy)
     top = highest_nodes(owner, node, z, grid_polygons(rows.outlines, STEP))
-    all_houses = np.zeros(len(top), np.int64)
-    top = top[highest_nodes(all_houses, node[top], z[top], (all_houses, node[top]))]
-    return np.column_stack((xy, z))[top]
+    return np.column_stack((xy[top], z[top]))
 
 
 def _sample_feet(rows: ModelRows) -> Array:

@@ -94,36 +94,30 @@ def grid_polygons(polygons: NDArray[np.object_], step: float) -> tuple[Index, In
     return grid_faces(xy, ring_start, face_start, step)
 
 
-def number_nodes(owner: Index, node: Index, low: Index, size: Index) -> Index:
-    """One number for each node, (n, 2), of each owner, by owner, row and column, int64 (n,).
-
-    `low` and `size`, (2,), are the least column and row, and how many there are of each.
-    """
-    numbers: Index = (owner * size[1] + node[:, 1] - low[1]) * size[0] + node[:, 0] - low[0]
-    return numbers
-
-
 def highest_nodes(owner: Index, node: Index, z: Array, mask: tuple[Index, Index]) -> Index:
-    """Find the highest of all nodes at one place of one owner, where a mask has the place, too.
+    """Find the highest of all nodes at one place that a mask has, too, for their owner.
 
-    `owner` (n,), `node` (n, 2) and `z` (n,) are owners, columns and rows, and heights (m) of nodes; `mask` has
-    owners and nodes of places that count. Gives the rows of the nodes, by owner, row and column.
+    `owner` (n,), `node` (n, 2) and `z` (n,) are owners, ascending, columns and rows, and heights (m) of nodes;
+    `mask` has owners and nodes of places that count. Gives the rows of the nodes, by row and column.
     """
     if not len(owner) or not len(mask[0]):
         return np.empty(0, np.int64)
-    both = np.concatenate((node, mask[1]))
-    low = both.min(axis=0)
-    size = both.max(axis=0) - low + 1
-    key, allowed = number_nodes(owner, node, low, size), number_nodes(*mask, low, size)
-    order = np.argsort(key, kind="stable")  # of long runs, which a stable sort merges
+    # Column by column: numpy reduces rows of two slowly.
+    (i, j), (mask_i, mask_j) = node.T, mask[1].T
+    left, below = min(i.min(), mask_i.min()), min(j.min(), mask_j.min())
+    width = max(i.max(), mask_i.max()) - left + 1
+    places = width * (max(j.max(), mask_j.max()) - below + 1)
+    key = (j - below) * width + i - left
+    allowed = np.sort(mask[0] * places + (mask_j - below) * width + mask_i - left, kind="stable")
+    wanted = owner * places + key
+    inside = np.flatnonzero(allowed[np.minimum(np.searchsorted(allowed, wanted), len(allowed) - 1)] == wanted)
+    order = inside[np.argsort(key[inside], kind="stable")]  # of long runs, which a stable sort merges
+    if not len(order):
+        return order
     key, height = key[order], z[order]
     start = np.flatnonzero(np.diff(key, prepend=key[0] - 1))
     top = np.repeat(np.maximum.reduceat(height, start), np.diff(start, append=len(key)))
-    last = np.maximum.reduceat(np.where(height == top, np.arange(len(key)), 0), start)
-    order, key = order[last], key[last]
-    allowed = np.sort(allowed, kind="stable")
-    at = np.minimum(np.searchsorted(allowed, key), len(allowed) - 1)
-    found: Index = order[allowed[at] == key]
+    found: Index = order[np.maximum.reduceat(np.where(height == top, np.arange(len(key)), 0), start)]
     return found
 
 

@@ -140,7 +140,10 @@ def shape_stage(config: Config, number: int) -> Stage:
     reads = [Read(f"members-{number}", own=True), Read("houses", named_by=f"members-{number}")]
     reads += [Read(f"shapes-{number - 1}", own=True)] if number else []
     finer = FINER_PARAMETERS if config.keeps_model_roofs else ()
-    return Stage(f"shapes-{number}", Scope.TILE, shape_members, tuple(reads), (*CITY_PARAMETERS, *finer))
+    parameters = (*CITY_PARAMETERS, *finer)
+    return Stage(
+        f"shapes-{number}", Scope.TILE, shape_members, tuple(reads), parameters, version=2 if finer else 1
+    )
 
 
 def later_round(config: Config, number: int) -> list[Stage]:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from pipeline.simplification.house_clusters import find_close
 from pipeline.simplification.labels import Territories
 from pipeline.simplification.planar import COUNTS, PlanarCity, shape_planar
 from pipeline.simplification.shaping import Shaped
-from pipeline.simplification.snap import node_crossings, straighten
+from pipeline.simplification.snap import collapse, node_crossings, straighten
 from pipeline.simplification.square_cells import draw_cells
 from tests.helpers.campaigns import examples
 from tests.helpers.cities import CITY_OPTIONS
@@ -251,6 +252,16 @@ def test_a_cluster_whose_roofs_would_be_off_keeps_a_finer_clearance() -> None:
         assert rmse[2:].max() == pytest.approx(0.02, rel=0.05)
 
 
+@pytest.mark.parametrize(("least_moved", "left"), [(False, [0.0, 70.0]), (True, [0.0, 0.0])])
+def test_of_a_step_the_end_of_the_long_wall_can_stay(least_moved: bool, left: list[float]) -> None:
+    """A step of 7 cm between a wall of 11 m and a corner of shorter walls, which is the more important one."""
+    xy = np.array([[0, 0], [11000, 0], [0, 70], [0, 7000], [-400, 70]], np.float64)
+    edges = np.array([[0, 1], [0, 2], [2, 3], [2, 4], [1, 3], [3, 4]])
+    graph = make_graph(xy, np.zeros(5, np.int64), edges, np.zeros(6))
+    united, _ = collapse(graph, 300.0, least_moved=least_moved)
+    assert [left in united.xy.tolist(), len(united.xy)] == [True, 4]
+
+
 def test_houses_that_touch_in_a_corner_are_counted_or_parted() -> None:
     pair = (box(0, 0, 4, 4), box(4, 4, 8, 8))
     city = simplify(*pair)
@@ -329,8 +340,8 @@ def test_walls_that_do_not_settle_are_drawn_with_cells(manifold: bool, monkeypat
 def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch: pytest.MonkeyPatch) -> None:
     settle = pipeline.simplification.snap.settle
 
-    def fail(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
-        settled, restless, counts = settle(graph, clearance=clearance, chain_tolerance=chain_tolerance)
+    def fail(graph: WallGraph, *, clearance: float, **rules: Any) -> object:
+        settled, restless, counts = settle(graph, clearance=clearance, **rules)
         return settled, np.unique(graph.cluster[graph.xy[:, 0] < 20000]) if clearance == 500 else restless, counts
 
     monkeypatch.setattr(pipeline.simplification.shaping, "settle", fail)
@@ -345,7 +356,7 @@ def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch:
     ids=["two corners", "a corner and a wall"],
 )
 def test_the_check_believes_no_round(other: Polygon, monkeypatch: pytest.MonkeyPatch) -> None:
-    def claim(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
+    def claim(graph: WallGraph, *, clearance: float, chain_tolerance: float, least_moved: bool) -> object:
         assert clearance > chain_tolerance
         return graph, np.zeros(0, np.int64), Counter({"rounds": 1})
 
