@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -233,12 +234,8 @@ def _make_faces(faces: list[Any], values: Any, kinds: list[int], vertices: Verti
     index = np.array(corners, np.int64)
     if len(index) and index.min() < 0:
         raise IndexError(f"vertex {index.min()}")
-    return Faces(
-        check_places(vertices[index]),
-        np.concatenate(([0], np.cumsum(np.array(lengths, np.int64)))),
-        np.concatenate(([0], np.cumsum(np.array(sizes, np.int64)))),
-        np.array(sorts, np.int8),
-    )
+    ring_start, face_start = (np.array([0, *accumulate(counts)], np.int64) for counts in (lengths, sizes))
+    return Faces(check_places(vertices[index]), ring_start, face_start, np.array(sorts, np.int8))
 
 
 def read_relief(objects: Object, vertices: Vertices) -> list[Faces]:

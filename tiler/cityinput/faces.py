@@ -122,7 +122,7 @@ def join_faces(several: Iterable[Faces]) -> Faces:
 
 def check_places(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Give vertices back; ValueError where a coordinate is NaN, infinite or beyond `FARTHEST`."""
-    if not (np.abs(xyz) <= FARTHEST).all():
+    if xyz.size and not -FARTHEST <= xyz.min() <= xyz.max() <= FARTHEST:  # not where one is NaN
         raise ValueError(f"a coordinate is no number, or beyond ±{FARTHEST:g}")
     return xyz
 

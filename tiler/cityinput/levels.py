@@ -30,38 +30,33 @@ def rank_levels(levels: Sequence[float], asked: str) -> list[float]:
     return [*[level for level in known if level <= most][::-1], *[level for level in known if level > most], *none]
 
 
-def list_attempts(building: ModelBuilding, asked: str) -> list[tuple[float, list[Shape]]]:
-    """List what may be taken for a building, the best first: the best level among the shapes, and these.
+def choose_shapes(building: ModelBuilding, asked: str) -> Iterator[tuple[float, list[Shape]]]:
+    """Give what may be taken for a building, the best first: the best level among the shapes, and these.
 
     Each part has its best level; from one attempt to the next the best of all is left out. A building's own faces
     count where its parts have none that is better. None where the building has no level from 1 on.
     """
-    return list(_choose_shapes(building, asked))
+    shapes = [shape for shape in building.shapes if (shape.lod >= 1 or shape.lod == NO_LOD) and len(shape.faces)]
+    ranked = rank_levels([shape.lod for shape in shapes], asked)
+    of_level = {level: rank for rank, level in enumerate(ranked)}
+    of_owner: dict[str, list[tuple[int, Shape]]] = {}
+    for shape in shapes:
+        of_owner.setdefault(shape.owner, []).append((of_level[shape.lod], shape))
+    for first in range(len(ranked)):
+        chosen: list[Shape] = []
+        found = {owner: [rank for rank, _ in own if rank >= first] for owner, own in of_owner.items()}
+        best = {owner: min(ranks) for owner, ranks in found.items() if ranks}
+        others = min((rank for owner, rank in best.items() if owner != building.id), default=len(ranked))
+        for owner, rank in best.items():
+            if owner != building.id or rank <= others:
+                chosen += _of_one_kind([shape for own, shape in of_owner[owner] if own == rank])
+        if chosen:
+            yield ranked[min(best.values())], chosen
 
 
 def best_shapes(building: ModelBuilding, asked: str) -> tuple[Shape, ...]:
-    """Give the shapes of the first attempt of `list_attempts`; none where there is none."""
-    return next((tuple(chosen) for _, chosen in _choose_shapes(building, asked)), ())
-
-
-def _choose_shapes(building: ModelBuilding, asked: str) -> Iterator[tuple[float, list[Shape]]]:
-    """Give the best level and the shapes of each attempt."""
-    shapes = [shape for shape in building.shapes if len(shape.faces) and (shape.lod >= 1 or shape.lod == NO_LOD)]
-    ranked = rank_levels([shape.lod for shape in shapes], asked)
-    for first in range(len(ranked)):
-        chosen: list[Shape] = []
-        best: dict[str, int] = {}
-        for owner in dict.fromkeys(shape.owner for shape in shapes):
-            own = {ranked.index(s.lod) for s in shapes if s.owner == owner and ranked.index(s.lod) >= first}
-            if own:
-                best[owner] = min(own)
-        others = [rank for owner, rank in best.items() if owner != building.id]
-        for owner, rank in best.items():
-            if owner == building.id and others and min(others) < rank:
-                continue
-            chosen += _of_one_kind([s for s in shapes if s.owner == owner and s.lod == ranked[rank]])
-        if chosen:
-            yield ranked[min(best.values())], chosen
+    """Give the shapes of the first attempt of `choose_shapes`; none where there is none."""
+    return next((tuple(chosen) for _, chosen in choose_shapes(building, asked)), ())
 
 
 def find_outline(building: ModelBuilding) -> Faces:
@@ -74,6 +69,8 @@ def find_outline(building: ModelBuilding) -> Faces:
 
 def _of_one_kind(shapes: list[Shape]) -> list[Shape]:
     """Leave out shapes without named roofs where another one at the level has some: they are the same house."""
+    if len(shapes) == 1:
+        return shapes
     named = [shape for shape in shapes if (shape.faces.kind == ROOF).any()]
     return (
         named + [s for s in shapes if not (s.faces.kind == UNKNOWN).all() and s not in named] if named else shapes

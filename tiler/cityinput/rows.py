@@ -14,8 +14,8 @@ from pipeline.data.citymodel import make_ids
 from pipeline.data.notes import Note
 from pipeline.data.roofs import Roofs, join_roofs, take_roofs
 from tiler.cityinput.face_planes import FacePlanes, find_planes
-from tiler.cityinput.faces import GROUND, OUTLINE, ROOF, WALL, Faces, ModelBuilding, Shape, join_faces
-from tiler.cityinput.levels import find_outline, list_attempts
+from tiler.cityinput.faces import GROUND, NO_LOD, OUTLINE, ROOF, WALL, Faces, ModelBuilding, Shape, join_faces
+from tiler.cityinput.levels import choose_shapes, find_outline
 from tiler.georeference.frame import Frame, to_region
 
 ROUNDING = 0.001  # m; coordinates in plan are whole multiples of it
@@ -130,25 +130,25 @@ def make_rows(
     each other, the highest counts. A plane passes through the middle of its border, at right angles to the area
     vector.
     """
-    attempts = [list_attempts(building, asked) for building in buildings]
-    place = np.zeros(len(buildings), np.int64)  # which attempt each building is at
-    left = [k for k, tries in enumerate(attempts) if tries]
+    attempts = [choose_shapes(building, asked) for building in buildings]
+    left = {k: first for k, tries in enumerate(attempts) if (first := next(tries, None)) is not None}
+    best = {k: level for k, (level, _) in left.items()}
     done: dict[int, _Found] = {}
     while left:
-        tried = _find_roofs([(k, *attempts[k][place[k]]) for k in left], (frame, shift))
+        tried = _find_roofs([(k, *one) for k, one in left.items()], (frame, shift))
         done |= {k: found for k, found in tried.items() if len(found.surfaces)}
-        place[left] += 1
-        left = [k for k in left if k not in done and place[k] < len(attempts[k])]
+        later = ((k, next(attempts[k], None)) for k in left if k not in done)
+        left = {k: one for k, one in later if one is not None}
     outlines = [(k, 0.0, find_outline(one)) for k, one in enumerate(buildings) if k not in done]
     places = _find_outlines([each for each in outlines if len(each[2])], (frame, shift))
     notes: list[Note] = []
     kept = [k for k in range(len(buildings)) if k in done or k in places]
-    _count(len(buildings), place, (done, places), counts)
+    _count(len(buildings), best, (done, places), counts)
     rows = _assemble(buildings, kept, done, places)
     xy = shapely.get_coordinates(shapely.point_on_surface(rows.outlines)).reshape(-1, 2)
     where = dict(zip(kept, xy.tolist(), strict=True))
     for k, building in enumerate(buildings):
-        notes += _note(building, attempts[k], done.get(k), where.get(k))
+        notes += _note(building, best.get(k, NO_LOD), done.get(k), where.get(k))
     return rows, notes
 
 
@@ -301,7 +301,7 @@ def _assemble(
 
 def _count(
     n: int,
-    place: Index,
+    best: dict[int, float],
     found: tuple[dict[int, _Found], dict[int, shapely.Geometry]],
     counts: Counter[str],
 ) -> None:
@@ -311,7 +311,7 @@ def _count(
         if k in done:
             level = done[k].lod
             counts[f"model buildings at level {level:g}" if level >= 0 else "model buildings without level"] += 1
-            counts["model buildings at a lower level"] += int(place[k] > 1)
+            counts["model buildings at a lower level"] += int(level != best[k])
             counts["model roof surfaces"] += len(done[k].surfaces)
         elif k in places:
             counts["model buildings with an outline alone"] += 1
@@ -321,7 +321,7 @@ def _count(
 
 def _note(
     building: ModelBuilding,
-    attempts: Sequence[tuple[float, list[Shape]]],
+    best: float,
     found: _Found | None,
     place: Sequence[float] | None,
 ) -> list[Note]:
@@ -330,8 +330,8 @@ def _note(
     tell = partial(Note, subject=building.id, x=x, y=y)
     notes = [tell("model-fault", detail=fault) for fault in building.faults]
     if found is not None:
-        if attempts[0][0] != found.lod:
-            notes.append(tell("model-lower-level", detail=f"level {attempts[0][0]:g} has no roof; {found.lod:g}"))
+        if best != found.lod:
+            notes.append(tell("model-lower-level", detail=f"level {best:g} has no roof; {found.lod:g}"))
         if found.crossing:
             detail = f"{found.crossing} of its surfaces cross themselves; taken as they lie in plan"
             notes.append(tell("model-self-crossing", detail=detail))

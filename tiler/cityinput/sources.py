@@ -93,16 +93,16 @@ class _Survey:
 
     def add(self, building: ModelBuilding) -> None:
         self.n_buildings += 1
-        for shape in building.shapes:
-            if not len(shape.faces):
-                continue
-            self.n_vertices += len(shape.faces.xyz)
-            self.low = np.minimum(self.low, shape.faces.xyz.min(axis=0))
-            self.high = np.maximum(self.high, shape.faces.xyz.max(axis=0))
-            if self.right + self.wrong < ENOUGH:
-                sign = signed_volume(shape.faces) if shape.closed else upward_area(shape.faces)
-                self.right += sign > 0
-                self.wrong += sign < 0
+        shapes = [shape for shape in building.shapes if len(shape.faces)]
+        if shapes:
+            xyz = np.concatenate([shape.faces.xyz for shape in shapes])
+            self.n_vertices += len(xyz)
+            self.low = np.minimum(self.low, xyz.min(axis=0))
+            self.high = np.maximum(self.high, xyz.max(axis=0))
+        for shape in shapes if self.right + self.wrong < ENOUGH else ():
+            sign = signed_volume(shape.faces) if shape.closed else upward_area(shape.faces)
+            self.right += sign > 0
+            self.wrong += sign < 0
 
 
 def read_model_header(path: Path, axis_order: str = "", *, around: bool = False) -> CloudHeader:

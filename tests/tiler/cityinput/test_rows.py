@@ -22,7 +22,7 @@ from tests.tiler.cityinput.models import (
     write_sequence,
 )
 from tiler.cityinput.faces import ModelBuilding
-from tiler.cityinput.levels import list_attempts, rank_levels
+from tiler.cityinput.levels import choose_shapes, rank_levels
 from tiler.cityinput.model_blocks import ModelBlock, Wanted, read_model_blocks
 from tiler.cityinput.row_arrays import RowPacker, unpack_rows
 from tiler.cityinput.rows import ModelRows, make_rows
@@ -114,7 +114,7 @@ def test_parts_have_their_own_best_levels_and_the_whole_is_not_there_twice(tmp_p
     }
     path = write_json(tmp_path / "a.json", city_json(objects, [*CORNERS, *corners]))
     (building,) = [each for each in scan_model(path) if isinstance(each, ModelBuilding)]
-    attempts = list_attempts(building, "auto")
+    attempts = list(choose_shapes(building, "auto"))
     assert [(level, [len(one.faces) for one in shapes]) for level, shapes in attempts] == [(2.2, [7]), (1.2, [6])]
 
 
