@@ -559,8 +559,14 @@ def _tell(lines: Iterable[str], output: Path) -> int:
 
 
 def _wind(options: argparse.Namespace) -> int:
+    from tiler.wind.outlet_profile import write_outlet_profile
     from tiler.wind.study import WindMaps, assess_wind
 
+    if options.profile is not None:
+        lines = write_outlet_profile(options.directory, options.profile, overwrite=options.overwrite)
+        return _tell(lines, options.profile)
+    if options.rose is None or options.output is None:
+        raise ConfigError("wind: give --rose and --output for maps, or --profile for the profile at the outlet")
     maps = WindMaps(options.rose, options.rose_height, options.resolution)
     lines = assess_wind(options.directory, options.output, maps, overwrite=options.overwrite)
     return _tell(lines, options.output)

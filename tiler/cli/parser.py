@@ -478,13 +478,18 @@ def _add_check(check: argparse.ArgumentParser) -> None:
 def _add_wind(wind: argparse.ArgumentParser) -> None:
     wind.add_argument("directory", type=_on_disk, metavar="DIR", help="an exported wind case that has run")
     wind.add_argument(
+        "--profile",
+        type=Path,
+        metavar="FILE.csv",
+        help="instead write the profile at the outlet of bare ground, for --wind-table of another export",
+    )
+    wind.add_argument(
         "--rose",
         type=Path,
-        required=True,
         metavar="FILE.csv",
         help="wind rose: columns direction, share, scale, shape (Weibull), or direction, speed, share",
     )
-    wind.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
+    wind.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder to write")
     wind.add_argument("--overwrite", action="store_true", help="replace it if it exists")
     wind.add_argument(
         "--rose-height",

@@ -41,6 +41,7 @@ SOLID = ("walls", "roofs")
 BUILDINGS = '"building_.*"'
 PARTS = '"procBoundary.*"'
 PEDESTRIAN = "pedestrian"  # function object, surface and results of it
+OUTLET = "outlet"  # sampled by it, too: faces by which the wind leaves
 
 CONDITIONS = """// Wind from {direction:g} degrees at {sides}: change it here, for all parts.
 Uref    {speed};  // m/s, at the height Zref above the inlet's lowest point
@@ -84,6 +85,7 @@ POROUS = """{zone}
 """
 
 SAMPLING = """// Wind {height} m above the ground: one value a triangle of it, that of the cell it is in.
+// At the outlet one a face.
 {name}
 {{
     type            surfaces;
@@ -91,11 +93,12 @@ SAMPLING = """// Wind {height} m above the ground: one value a triangle of it, t
     executeControl  onEnd;
     writeControl    onEnd;
     surfaceFormat   raw;
-    fields          (U k);
+    fields          (U k epsilon);
     interpolationScheme cell;
     surfaces
     (
         {name} {{ type sampledTriSurfaceMesh; surface {name}.obj; source insideCells; interpolate false; }}
+        {outlet} {{ type patch; patches ({sides}); interpolate false; }}
     );
 }}
 """
@@ -233,7 +236,9 @@ def _write_case(case: Path, domain: Domain, wind: Wind, direction: float, *, par
         case,
         parts=parts,
         application="simpleFoam",
-        functions=SAMPLING.format(name=PEDESTRIAN, height=PEDESTRIAN_HEIGHT),
+        functions=SAMPLING.format(
+            name=PEDESTRIAN, height=PEDESTRIAN_HEIGHT, outlet=OUTLET, sides=" ".join(outlets)
+        ),
     )
     east, north = flow_of(direction)
     constants = {

@@ -133,23 +133,34 @@ def read_samples(case: WindCase, direction: float, triangles: Triangles) -> Samp
     InputError
         If there are none, or they are not of this surface.
     """
+    path = sampled_file(case, direction, f"U_{PEDESTRIAN}")
+    table = read_table(path, 6)
+    speed = _match(table[:, :3] + case.origin, np.linalg.norm(table[:, 3:], axis=1), triangles.centres)
+    if np.isnan(speed).all():
+        raise InputError(f"{path}: none of its {len(table)} samples is over a triangle of the case; run it again")
+    return Sampled(speed, int(path.parent.name))
+
+
+def sampled_file(case: WindCase, direction: float, name: str) -> Path:
+    """Return the file of what was sampled last; InputError if nothing was."""
     folder = case.case_of(direction) / "postProcessing" / PEDESTRIAN
     times = [int(path.name) for path in folder.glob("*") if path.name.isdigit()] if folder.is_dir() else []
     if not times:
         raise InputError(
             f"{folder}: nothing was sampled yet for {direction:g} degrees; run {folder.parents[1]}/Allrun"
         )
-    path = folder / str(max(times)) / f"U_{PEDESTRIAN}.raw"
+    return folder / str(max(times)) / f"{name}.raw"
+
+
+def read_table(path: Path, width: int) -> Floats:
+    """Read rows of places and values, (n, width); InputError if they are not there."""
     try:
         table = np.loadtxt(path, np.float64, ndmin=2)
-        if table.shape[1] != 6 or not np.isfinite(table).all():
-            raise ValueError(f"rows of {table.shape[1]} numbers, expected 6 finite ones")
+        if table.shape[1] != width or not np.isfinite(table).all():
+            raise ValueError(f"rows of {table.shape[1]} numbers, expected {width} finite ones")
     except (OSError, ValueError, IndexError) as error:
         raise InputError(f"{path}: is missing or damaged ({error}); run the case again") from None
-    speed = _match(table[:, :3] + case.origin, np.linalg.norm(table[:, 3:], axis=1), triangles.centres)
-    if np.isnan(speed).all():
-        raise InputError(f"{path}: none of its {len(table)} samples is over a triangle of the case; run it again")
-    return Sampled(speed, max(times))
+    return table
 
 
 def _match(places: Floats, values: Floats, centres: Floats) -> Floats:

@@ -118,6 +118,48 @@ def test_directions_far_from_the_simulated_ones_are_said(case: Path, capsys: pyt
     assert "warning: 50% of the time the wind comes from more than 15 degrees beside" in capsys.readouterr().out
 
 
+def test_the_profile_at_the_outlet_by_hand(case: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two rows of faces, one with two faces; heights count from the inlet's ground, which is at 7 m."""
+    record, place = case / "export.json", case / "postProcessing" / "pedestrian" / "9"
+    lowest = {"west": 7.0, "east": 7.1, "ground": 7.0, "top": 60.0}
+    wind = {"directions": [270.0], "speed": 5.0, "height": 10.0, "roughness": 0.1}
+    words = {"crs": "EPSG:28992", "wind": wind, "meshes": [{"lowest": lowest, "highest": {"ground": 7.2}}]}
+    place.mkdir(parents=True)
+    heights, speeds = (8.0, 8.02, 17.0), (1.9, 2.1, 5.5)
+    for name, values in (
+        ("U", [f"{u} 1 0" for u in speeds]),
+        ("k", (0.3, 0.5, 0.2)),
+        ("epsilon", (0.1, 0.1, 0.02)),
+    ):
+        rows = [f"8 1 {z} {value}" for z, value in zip(heights, values, strict=True)]
+        (place / f"{name}_outlet.raw").write_text("\n".join(["# x y z", *rows]) + "\n")
+
+    def run(*options: str, **changed: object) -> tuple[int, str]:
+        record.write_text(json.dumps(words | changed))
+        status = main(["wind", str(case), *options])
+        said = capsys.readouterr()
+        return status, said.out + said.err
+
+    table = case.parent / "inlet.csv"
+    status, said = run("--profile", str(table))
+    assert (status, table.read_text()) == (
+        0, "height,speed,k,epsilon\n1.01,2,0.4,0.1\n10,5.5,0.2,0.02\n"
+    )  # fmt: skip
+    # The inlet has 5 ln(11.1) / ln(101) = 2.607 m/s at 1.01 m.
+    assert "speeds at the outlet are -23.3% to +10.0% off those of the inlet, most at 1.01 m" in said
+    assert "inlet.csv: exists; give another --profile, or --overwrite" in run("--profile", str(table))[1]
+    assert "give --rose and --output for maps, or --profile" in run()[1]
+    again = ("--profile", str(table), "--overwrite")
+    assert "has 2 directions; --profile takes a case of one" in run(*again, wind=wind | {"directions": [0, 9]})[1]
+    meshes = [{"lowest": lowest | {"walls": 7.0}, "highest": {"ground": 7.2}}]
+    assert "--profile takes a case of bare ground; this one has walls" in run(*again, meshes=meshes)[1]
+    meshes = [{"lowest": lowest, "highest": {"ground": 8.2}}]
+    assert "takes level ground, within 0.3 m; this spans 1.2 m" in run(*again, meshes=meshes)[1]
+    assert "export.json: is damaged ('ground')" in run(*again, meshes=[{"lowest": lowest, "highest": {}}])[1]
+    (place / "k_outlet.raw").unlink()
+    assert "k_outlet.raw: is missing or damaged" in run(*again)[1]
+
+
 def test_what_cannot_be_mapped(case: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refused(*words: str) -> str:
         assert main(command(case, *words)) in (1, 2)
