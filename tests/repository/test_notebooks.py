@@ -64,6 +64,10 @@ def test_first_poisson_runs_and_draws(tmp_path: Path) -> None:
     fixed = re.search(r"(\d+) unknowns, (\d+) of them fixed, u between 0 and", said)
     assert fixed
     assert 0 < int(fixed[2]) < int(fixed[1])
+    patch = re.search(r"CPU: (\d+) unknowns, a linear field is off by (\S+) of its range", said)
+    assert patch
+    assert 0 < int(patch[1]) < int(fixed[1])
+    assert float(patch[2]) < 1e-9
     assert (tmp_path / "first_poisson" / "out" / "run.json").is_file()
     assert len(pictures) == 1
 

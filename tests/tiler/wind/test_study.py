@@ -119,13 +119,13 @@ def test_directions_far_from_the_simulated_ones_are_said(case: Path, capsys: pyt
 
 
 def test_the_profile_at_the_outlet_by_hand(case: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two rows of faces, one with two faces; heights count from the inlet's ground, which is at 7 m."""
+    """Two rows of faces, one with two faces; heights count from the ground there, which is at 7.1 m."""
     record, place = case / "export.json", case / "postProcessing" / "pedestrian" / "9"
     lowest = {"west": 7.0, "east": 7.1, "ground": 7.0, "top": 60.0}
     wind = {"directions": [270.0], "speed": 5.0, "height": 10.0, "roughness": 0.1}
-    words = {"crs": "EPSG:28992", "wind": wind, "meshes": [{"lowest": lowest, "highest": {"ground": 7.2}}]}
+    words = {"crs": "EPSG:28992", "wind": wind, "meshes": [{"lowest": lowest, "highest": {"ground": 7.02}}]}
     place.mkdir(parents=True)
-    heights, speeds = (8.0, 8.02, 17.0), (1.9, 2.1, 5.5)
+    heights, speeds = (8.1, 8.12, 17.1), (1.9, 2.1, 5.5)
     for name, values in (
         ("U", [f"{u} 1 0" for u in speeds]),
         ("k", (0.3, 0.5, 0.2)),
@@ -151,10 +151,10 @@ def test_the_profile_at_the_outlet_by_hand(case: Path, capsys: pytest.CaptureFix
     assert "give --rose and --output for maps, or --profile" in run()[1]
     again = ("--profile", str(table), "--overwrite")
     assert "has 2 directions; --profile takes a case of one" in run(*again, wind=wind | {"directions": [0, 9]})[1]
-    meshes = [{"lowest": lowest | {"walls": 7.0}, "highest": {"ground": 7.2}}]
+    meshes = [{"lowest": lowest | {"walls": 7.0}, "highest": {"ground": 7.02}}]
     assert "--profile takes a case of bare ground; this one has walls" in run(*again, meshes=meshes)[1]
     meshes = [{"lowest": lowest, "highest": {"ground": 8.2}}]
-    assert "takes level ground, within 0.3 m; this spans 1.2 m" in run(*again, meshes=meshes)[1]
+    assert "takes level ground, within 0.05 m; this spans 1.2 m" in run(*again, meshes=meshes)[1]
     assert "export.json: is damaged ('ground')" in run(*again, meshes=[{"lowest": lowest, "highest": {}}])[1]
     (place / "k_outlet.raw").unlink()
     assert "k_outlet.raw: is missing or damaged" in run(*again)[1]
