@@ -35,7 +35,7 @@ BITS = {
         closed(constant={"enum": [0, 1]}, availableCount_=INDEX),
     ]
 }
-SCALAR: dict[str, Schema] = {"type": {"const": "SCALAR"}, "componentType": {"enum": ["FLOAT32", "FLOAT64"]}}
+SCALAR: Schema = {"type": {"const": "SCALAR"}, "componentType": {"enum": ["FLOAT32", "FLOAT64"]}}
 PROPERTY = {
     "anyOf": [
         closed(type={"const": "STRING"}, name_=TEXT),
@@ -44,7 +44,7 @@ PROPERTY = {
     ]
 }
 CLASSES = closed(id=NAME, classes=some(closed(properties=some(PROPERTY))))
-TABLE = closed(**{"class": NAME, "count": COUNT, "properties": some(closed(values=INDEX, stringOffsets_=INDEX))})
+TABLE = closed(class_=NAME, count=COUNT, properties=some(closed(values=INDEX, stringOffsets_=INDEX)))
 TILING = closed(
     subdivisionScheme={"const": "QUADTREE"}, availableLevels=COUNT, subtreeLevels=COUNT, subtrees=closed(uri=TEXT)
 )

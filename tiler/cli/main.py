@@ -276,9 +276,12 @@ def _dashboard(options: argparse.Namespace) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
-    from tiler.tiles3d.view import show_tiles
+    from tiler.serving.serve import view_city
+    from tiler.store.out_folder import RUN_RECORD
+    from tiler.tiles3d.view import serve_tiles, show_until_interrupted
 
-    show_tiles(options.directory, f"{options.host}:{options.port}", say)
+    serve = view_city if (options.directory / RUN_RECORD).is_file() else serve_tiles
+    show_until_interrupted("view", serve(options.directory, f"{options.host}:{options.port}"), say)
     return 0
 
 

@@ -1,5 +1,6 @@
 """Edits of several clients, done by one writer in their order: what waits together is one transaction."""
 
+import gc
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -147,6 +148,8 @@ class EditQueue:
                 self._follow(lambda: write_city_files(self._city, executor))
                 if not self.trouble:  # of these files tiles are made that could not be followed
                     self._follow(self._at_rest)
+                gc.collect()
+                gc.freeze()  # what is remembered stays: the next edits need not look through it
                 self.state = REST
 
     def _follow(self, work: Callable[[], None]) -> None:

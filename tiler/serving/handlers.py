@@ -26,11 +26,10 @@ COOKIE = "citystitch"
 
 @dataclass(frozen=True)
 class Service:
-    """What all paths answer from: the city, its queue of edits, and the token of who may ask; empty for none."""
+    """What the paths of edits answer from: the city, and its queue of edits."""
 
     city: City
     queue: EditQueue
-    token: str
 
 
 class Keyed(Guarded):
@@ -38,16 +37,16 @@ class Keyed(Guarded):
 
     Attributes
     ----------
-    service : Service
-        What they answer from; a server has classes of its own with it.
+    token : str
+        That of who may ask, empty for none; a server has classes of its own with it.
     """
 
-    service: Service
+    token = ""
 
     def prepare(self) -> None:
         """Refuse who has no token, and writes that another page of a browser sends."""
         super().prepare()
-        token, reads = self.service.token, self.request.method in ("GET", "HEAD")
+        token, reads = self.token, self.request.method in ("GET", "HEAD")
         given = self.request.headers.get("Authorization", "").removeprefix("Bearer ")
         known = bool(token) and _same(given, token)
         if token and not known and not (reads and _same(self.get_cookie(COOKIE, "") or "", cookie_of(token))):
@@ -67,12 +66,9 @@ class Api(Keyed):
         self.finish(json.dumps(found))
 
     def refuse(self, error: Exception) -> None:
-        """Tell why an edit was not done."""
+        """Tell why something was not done."""
         status = 503 if isinstance(error, OutputError | StoppedError) else 422
-        if isinstance(error, ConflictError):
-            changed = [describe_edit(edit) for edit in error.edits]
-            self.reply({"error": str(error), "changed": changed, "revision": self.service.queue.revision}, 409)
-        elif isinstance(error, CityError):
+        if isinstance(error, CityError):
             self.reply({"error": str(error)}, status)
         else:
             self.reply({"error": f"{type(error).__name__}: {error}; the city is as before"}, 500)
@@ -86,6 +82,8 @@ class Api(Keyed):
 class CityState(Api):
     """``GET /city``: revision, and what the writer does."""
 
+    service: Service
+
     def get(self) -> None:
         """Send the state."""
         city, queue = self.service.city, self.service.queue
@@ -95,6 +93,8 @@ class CityState(Api):
 
 class EditList(Api):
     """``GET /edits``: the journal; ``POST /edits``: an edit, answered when it is done."""
+
+    service: Service
 
     def get(self) -> None:
         """Send all edits."""
@@ -115,12 +115,17 @@ class EditList(Api):
                 self.reply(describe_edit(found))
             else:
                 self.reply(describe_outcome(await asyncio.wrap_future(found)), 201)
+        except ConflictError as error:
+            changed = [describe_edit(edit) for edit in error.edits]
+            self.reply({"error": str(error), "changed": changed, "revision": service.queue.revision}, 409)
         except Exception as error:
             self.refuse(error)
 
 
 class OneEdit(Api):
     """``GET /edits/ID``: what became of the edit of that name."""
+
+    service: Service
 
     def get(self, name: str) -> None:
         """Send the edit, or that it waits."""

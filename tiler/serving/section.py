@@ -27,14 +27,14 @@ class Section(Api):
     corners from that place (m), and the radius ratio of its cell.
     """
 
+    directory: Path
     globe: Globe
 
     async def get(self) -> None:
         """Cut the mesh as it is now."""
         try:
             ends = np.array([self._place("from"), self._place("to")])
-            directory = self.service.city.directory
-            work = asyncio.get_running_loop().run_in_executor(None, cut_section, directory, self.globe, ends)
+            work = asyncio.get_running_loop().run_in_executor(None, cut_section, self.directory, self.globe, ends)
             self.set_header("Content-Type", "application/octet-stream")
             self.finish(await work)
         except CityError as error:

@@ -1,11 +1,11 @@
 """The web server of a run folder: `citystitch serve`."""
 
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pipeline.data.errors import ConfigError
@@ -19,9 +19,12 @@ from tiler.serving.bodies import MOST_BYTES
 from tiler.serving.edit_queue import EditQueue
 from tiler.serving.handlers import COOKIE, CityState, EditList, Keyed, OneEdit, Service, cookie_of
 from tiler.serving.section import Section
+from tiler.store.folder_lock import only_run
+from tiler.store.kept import IN_PIECES, IN_STORE, need
+from tiler.tiles3d.base import open_base
 from tiler.tiles3d.globe import Globe
 from tiler.tiles3d.update import MERGING_LEVEL, TILES, update_tileset
-from tiler.tiles3d.view import PAGE, Files
+from tiler.tiles3d.view import PAGE, Files, show_until_interrupted
 from tiler.words.plain_text import say_nothing
 
 LEAST_TOKEN = 16  # characters
@@ -42,7 +45,7 @@ class Page(KeyedFiles):
 
     def prepare(self) -> None:
         """Take the token out of the address."""
-        token = self.get_query_argument("token", "") if self.service.token else ""
+        token = self.get_query_argument("token", "") if self.token else ""
         if token:
             self.request.headers["Authorization"] = f"Bearer {token}"
         super().prepare()
@@ -110,10 +113,10 @@ def serve_city(
         raise ConfigError(
             f"the token has {len(token)} characters, at least {LEAST_TOKEN} expected; take a longer one"
         )
-    folder, given = directory / FOLDER, placed or Placed()
+    given = placed or Placed()
 
     def write_tiles(merging_level: float = 0.0) -> None:
-        update_tileset(folder, find_files(directory), merging_level=merging_level, **vars(given))
+        update_tileset(directory / FOLDER, find_files(directory), merging_level=merging_level, **vars(given))
 
     with ExitStack() as stack:
         city = stack.enter_context(held_city(directory, workers, say))
@@ -121,23 +124,43 @@ def serve_city(
         write_tiles()
         open_executor = partial(_warm_executor, workers, city.config) if workers else nullcontext
         queue = EditQueue(city, lambda _: write_tiles(MERGING_LEVEL), open_executor, say, at_rest=write_tiles)
-        service, globe = Service(city, queue, token), Globe(city.crs, city.bounds, **vars(given))
-
-        def rules(loopback: bool) -> list[Any]:
-            own = {"service": service, "loopback": loopback, "globe": globe}
-            given: list[tuple[str, type[Keyed], dict[str, str]]] = [
-                ("/city", CityState, {}),
-                ("/edits", EditList, {}),
-                ("/edits/(.+)", OneEdit, {}),
-                ("/section", Section, {}),
-                ("/tiles/(.*)", KeyedFiles, {"path": str((folder / TILES).resolve())}),
-                ("/(.*)", Page, PAGE),
-            ]
-            return [(path, type(kind.__name__, (kind,), own), words) for path, kind, words in given]
-
+        paths = {"/city": CityState, "/edits": EditList, "/edits/(.+)": OneEdit}
+        globe = Globe(city.crs, city.bounds, **vars(given))
+        rules = _make_rules(directory, globe, paths, service=Service(city, queue), token=token)
         root = stack.enter_context(serve_rules(rules, address, most_body=2 * MOST_BYTES))
         stack.enter_context(queue)  # ends before the server: clients are told
         yield f"{root}/"
+
+
+@contextmanager
+def view_city(directory: Path, address: str) -> Iterator[str]:
+    """Show a finished run, which this process holds meanwhile: as `serve_city`, without edits; gives its URL.
+
+    InputError, ConfigError and OutputError as there.
+    """
+    files = find_files(directory)
+    need(directory, IN_STORE, IN_PIECES)
+    with only_run(directory):
+        update_tileset(directory / FOLDER, files)
+        with serve_rules(_make_rules(directory, open_base(files).site.globe), address) as root:
+            yield f"{root}/"
+
+
+def _make_rules(
+    directory: Path, globe: Globe, paths: Mapping[str, type[Keyed]] = MappingProxyType({}), **own: Any
+) -> Callable[[bool], list[Any]]:
+    """Make the paths of a server: tiles of a run, their page and sections, and others, with attributes for all."""
+    own |= {"directory": directory, "globe": globe}
+    tiles = {"path": str((directory / FOLDER / TILES).resolve())}
+    files = [("/tiles/(.*)", KeyedFiles, tiles), ("/(.*)", Page, PAGE)]
+    given: list[tuple[str, type[Keyed], dict[str, str]]] = [(path, kind, {}) for path, kind in paths.items()]
+    given += [("/section", Section, {}), *files]
+
+    def rules(loopback: bool) -> list[Any]:
+        mine = own | {"loopback": loopback}
+        return [(path, type(kind.__name__, (kind,), mine), words) for path, kind, words in given]
+
+    return rules
 
 
 @contextmanager
@@ -151,7 +174,4 @@ def _warm_executor(workers: int, config: Config) -> Iterator[Executor]:
 
 def show_city(directory: Path, address: str, say: Callable[[str], None], **given: Any) -> None:
     """Serve a run folder until the process is interrupted; what is at work then ends first. See `serve_city`."""
-    with serve_city(directory, address, say=say, **given) as url:
-        say(f"serve: {url} (Ctrl-C ends it)")
-        with suppress(KeyboardInterrupt):
-            threading.Event().wait()
+    show_until_interrupted("serve", serve_city(directory, address, say=say, **given), say)

@@ -6,7 +6,7 @@ The page and the libraries that it needs are in ``viewer/``: nothing is fetched 
 import os
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from tornado.web import StaticFileHandler
 from pipeline.data.errors import InputError
 from tiler.dashboard.handlers import POLICY, Guarded
 from tiler.dashboard.server import serve_rules
-from tiler.store.out_folder import RUN_RECORD
 from tiler.tiles3d.subtrees import TILESET
 
 VIEWER = Path(__file__).parent / "viewer"
@@ -57,11 +56,6 @@ def serve_tiles(folder: Path, address: str) -> Iterator[str]:
         If nobody can listen there.
     """
     if not (folder / TILESET).is_file():
-        if (folder / RUN_RECORD).is_file():
-            raise InputError(
-                f"{folder}: is a run; citystitch serve {folder} shows it, or first citystitch export {folder} "
-                "--format 3dtiles -o tiles"
-            )
         raise InputError(
             f"{folder}: has no {TILESET}; write one by citystitch export RUN --format 3dtiles -o tiles"
         )
@@ -74,9 +68,9 @@ def serve_tiles(folder: Path, address: str) -> Iterator[str]:
         yield f"{root}/"
 
 
-def show_tiles(folder: Path, address: str, say: Callable[[str], None]) -> None:
-    """Serve a folder of 3D Tiles until the process is interrupted; errors as of `serve_tiles`."""
-    with serve_tiles(folder, address) as url:
-        say(f"view: {url} (Ctrl-C ends it)")
+def show_until_interrupted(what: str, server: AbstractContextManager[str], say: Callable[[str], None]) -> None:
+    """Let a server run until the process is interrupted, and say its URL; errors as of the server."""
+    with server as url:
+        say(f"{what}: {url} (Ctrl-C ends it)")
         with suppress(KeyboardInterrupt):
             threading.Event().wait()

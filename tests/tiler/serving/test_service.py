@@ -24,7 +24,7 @@ from tiler.export.export import export_run
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.serving.bodies import MOST_BYTES, make_asked
 from tiler.serving.edit_queue import REST, EditQueue
-from tiler.serving.serve import FOLDER, serve_city
+from tiler.serving.serve import FOLDER, serve_city, view_city
 from tiler.store.out_folder import CITY_MODEL
 from tiler.tiles3d.globe import Globe, geocentric
 from tiler.tiles3d.slices import cut_pieces, make_slices
@@ -147,14 +147,24 @@ def test_the_page_and_the_tiles_are_there(url: str) -> None:
     assert ask(url, "/tiles/%2e%2e/%2e%2e/run.json")[0] == 403
 
 
+@pytest.fixture(scope="module")
+def viewed(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """A city that is shown, and not edited."""
+    city = shutil.copytree(small_run, tmp_path_factory.mktemp("viewed") / "city")
+    with view_city(city, "127.0.0.1:0") as url:
+        yield url, city
+
+
 @pytest.mark.parametrize("beside", [-9.0, 9.0])  # a seam, which leaves the box of its tile
 def test_a_section_has_the_cells_of_an_upright_slice(
-    beside: float, url: str, city: Path, monkeypatch: pytest.MonkeyPatch
+    beside: float, viewed: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    xmin, ymin, xmax, ymax = ask(url, "/city")[1]["bounds"]
+    url, city = viewed
+    region = json.loads((city / "run.json").read_text())["region"]
+    xmin, ymin, xmax, ymax = region["bounds"]
     (seam,) = {tile["box"][2] for tile in json.loads((city / "run.json").read_text())["tiles"].values()} - {xmax}
     line = (seam + beside, ymin + 5, seam + beside, ymax - 5)
-    globe = Globe(ask(url, "/city")[1]["crs"], (xmin, ymin, xmax, ymax))
+    globe = Globe(region["crs"], (xmin, ymin, xmax, ymax))
     ends = geocentric(globe.geographic(np.array([[*line[:2], 0.0], [*line[2:], 0.0]]))).tolist()
     query = "&".join(f"{name}={','.join(map(repr, end))}" for name, end in zip(("from", "to"), ends, strict=True))
     status, data = ask(url, f"/section?{query}")
@@ -168,6 +178,14 @@ def test_a_section_has_the_cells_of_an_upright_slice(
     assert ask(url, "/section?from=1,2,3&to=4e6,2,3")[0] == 422
     monkeypatch.setattr("tiler.serving.section.MOST_TRIANGLES", 3)
     assert ask(url, f"/section?{query}")[0] == 422
+
+
+def test_a_city_that_is_shown_is_not_edited(viewed: tuple[str, Path], url: str) -> None:
+    for place in (url, viewed[0]):
+        with urllib.request.urlopen(f"{place}tiles/tileset.json") as answer:
+            assert answer.headers["Citystitch-Section"] == "yes"  # by which the page offers it
+    assert ask(viewed[0], "/edits", {"action": "remove", "building": "x"})[0] >= 400
+    assert ask(viewed[0], "/city")[0] == 404
 
 
 def test_others_need_the_token(small_run: Path, tmp_path: Path) -> None:
