@@ -1,5 +1,6 @@
 """What a process that goes over the same files again and again has learnt of those that have not changed since."""
 
+import os
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -76,7 +77,7 @@ def remember(
     if known is None or in_bucket(path):
         return look()
     try:
-        stat = path.stat()
+        stat = os.stat(path)
     except OSError:
         return look()
     if not S_ISREG(stat.st_mode) or (largest is not None and stat.st_size > largest):

@@ -24,14 +24,12 @@ from tiler.store.checksums import open_binary
 
 if TYPE_CHECKING:
     import zarr
-    from zarr.abc.buffer import Buffer
 
 GROUP = "zarr.json"  # zarr's description of a group or an array
 NPY = ".npy"
 CHUNK_BYTES = 4 * 2**20  # about what one read or write of a large array moves
 MOST_ROW = 2**30  # bytes; the longest row of a terrain has some 10^5
 MOST_AXES = 8
-MANY_CHUNKS = {"codec_pipeline.batch_size": 1000}  # of an array are handed to zarr's threads at once
 KINDS = "biufU"  # of numbers, booleans and strings
 BLOSC_SIZES = (4, 12)  # bytes of a chunk that begin its sizes, unpacked and packed, which Blosc takes as true
 
@@ -90,7 +88,6 @@ class ResultFile:
             if name.endswith(suffix)
         )
         self._opened: dict[str, zarr.Array[Any]] = {}
-        self._parts: dict[str, dict[str, Buffer]] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -171,34 +168,33 @@ class ResultFile:
             if name + NPY in self._files:
                 return _unpack_npy(self._zip.read(name + NPY))
             import zarr
+            from zarr.buffer import default_buffer_prototype
             from zarr.storage import MemoryStore
 
-            parts = self._parts[name] = {GROUP: _buffer(self._zip.read(f"{name}/{GROUP}"))}
-            with zarr.config.set(MANY_CHUNKS):
-                array = zarr.open_array(MemoryStore(parts), mode="r", zarr_format=3)
+            parts = {GROUP: default_buffer_prototype().buffer.from_bytes(self._zip.read(f"{name}/{GROUP}"))}
+            array = zarr.open_array(MemoryStore(parts), mode="r", zarr_format=3)
             _check_array(array, sum(file.startswith(f"{name}/c/") for file in self._files))
             self._opened[name] = array
             return array
 
     def _read_chunks(self, name: str, array: "zarr.Array[Any]", spans: Sequence[Span]) -> NDArray[Any]:
-        """Let zarr unpack a part of an array, of those files of the zip that hold some of it."""
+        """Unpack a part of an array, of those files of the zip that hold some of it.
+
+        zarr itself would take longer to hand a chunk to its threads than it takes to unpack.
+        """
+        from numcodecs import blosc
+
         size = math.prod(array.chunks) * array.dtype.itemsize
-        places = [
-            range(start // step, -(-stop // step) if stop > start else start // step)
-            for (start, stop), step in zip(spans, array.chunks, strict=True)
-        ]
-        parts = self._parts[name]  # what zarr sees of the result
-        keys = ["/".join(("c", *map(str, place))) for place in product(*places)]
-        for key in keys:
-            data = self._zip.read(f"{name}/{key}")  # zarr itself reads a lost chunk as zeros
+        found = np.empty([stop - start for start, stop in spans], array.dtype)
+        for place in product(*(_pieces_of(*span, step) for span, step in zip(spans, array.chunks, strict=True))):
+            key = "/".join(("c", *(str(k) for k, _, _ in place)))
+            data = self._zip.read(f"{name}/{key}")
             sizes = [int.from_bytes(data[k : k + 4], "little") for k in BLOSC_SIZES]
             if sizes != [size, len(data)]:
                 raise ValueError(f"chunk {key} does not unpack to {size} bytes")
-            parts[key] = _buffer(data)
-        found: Any = array[tuple(slice(*span) for span in spans)]
-        for key in keys:
-            del parts[key]
-        return np.asarray(found)
+            chunk = np.frombuffer(blosc.decompress(data), array.dtype).reshape(array.chunks)
+            found[tuple(into for _, into, _ in place)] = chunk[tuple(of for _, _, of in place)]
+        return found
 
     @contextmanager
     def _damage(self, what: str) -> Iterator[None]:
@@ -212,6 +208,13 @@ class ResultFile:
             raise InputError(
                 f"{self._title}: {what} in {self._path} {state} ({error}); run again: it is made anew"
             ) from error
+
+
+def _pieces_of(start: int, stop: int, step: int) -> Iterator[tuple[int, slice, slice]]:
+    """Give the chunks that hold a part of an axis, and where these places are in what is read, and in them."""
+    for k in range(start // step, -(-stop // step) if stop > start else start // step):
+        first, last = max(start, k * step), min(stop, (k + 1) * step)
+        yield k, slice(first - start, last - start), slice(first - k * step, last - k * step)
 
 
 def _unpack_npy(data: bytes) -> NDArray[Any]:
@@ -239,9 +242,3 @@ def _check_array(array: "zarr.Array[Any]", n_files: int) -> None:
         raise ValueError(f"codecs {', '.join(type(codec).__name__ for codec in codecs)}")
     if array.nchunks != n_files:
         raise ValueError(f"{n_files} files for the {array.nchunks} chunks of {array.shape}")
-
-
-def _buffer(data: bytes) -> "Buffer":
-    from zarr.buffer import default_buffer_prototype
-
-    return default_buffer_prototype().buffer.from_bytes(data)

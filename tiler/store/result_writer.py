@@ -17,12 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from tiler.objects.places import in_bucket
 from tiler.store.atomic import disk_errors, replacing
 from tiler.store.checksums import TAIL, seal_file
-from tiler.store.result_file import GROUP, KINDS, MANY_CHUNKS, NPY, rows_per_chunk
+from tiler.store.result_file import GROUP, KINDS, NPY, rows_per_chunk
 
 if TYPE_CHECKING:
     import zarr
     from zarr.abc.buffer import Buffer
 
+MANY_CHUNKS = {"codec_pipeline.batch_size": 1000}  # of an array are handed to zarr's threads at once
 SMALL_BYTES = 512 * 2**10  # zarr takes longer to open and read a smaller array than numpy
 SQUARE = 320  # rows and columns of a raster's chunks: a neighbour mostly reads a strip
 DIGEST_BYTES = 16  # of the 32 that BLAKE3 gives

@@ -1,6 +1,7 @@
 """The store: results by stage and name, a file each (`tiler.store.result_file`), whole or not at all."""
 
 import json
+import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +21,7 @@ from tiler.store.result_writer import DIGEST_BYTES, Writer, hash_content, raw_by
 
 MANIFEST = "manifest.jsonl"  # the only file beside the stages, see `tiler.workflow.audit`
 SUFFIX = ".zip"
+PLAIN = re.compile(r"[^./\\\0][^/\\\0]*")  # name of a file that is not hidden
 SMALL = 2**18  # bytes of a result that a process which remembers keeps in memory
 
 
@@ -38,9 +40,9 @@ class Store:
     def file(self, stage: str, name: str) -> Path:
         """Describe where a result lies; ValueError for a name that is no plain file name."""
         for part in (stage, name):
-            if not part or part[0] == "." or any(sign in part for sign in "/\\\0"):
+            if not PLAIN.fullmatch(part):
                 raise ValueError(f"{part!r} cannot name a result of the store")
-        return self.path / stage / f"{name}{SUFFIX}"
+        return self.path / f"{stage}/{name}{SUFFIX}"
 
     def writer(self, stage: str, name: str) -> Writer:
         """Begin a result: a context manager with ``put``, ``append`` and ``commit``."""

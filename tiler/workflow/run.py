@@ -217,7 +217,8 @@ def _run(
                 sync_meanwhile(out / RUN_RECORD)
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(given, out)
-        begin_watching(config, out, plan, own, watchers, shown=means.shown)
+        # Where the files of city models are left out, the folder is that of an edit, which has no page.
+        begin_watching(config, out, plan, own, watchers, shown=means.shown if means.city_files else None)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means, add_up(journal))
         record |= {"edits": [edit.number for edit in journal]} if journal else {}
         stages = watchers.state.stages.items()

@@ -82,7 +82,7 @@ def begin_watching(
     own: OwnStages,
     watchers: Watchers,
     *,
-    shown: Path | None = None,
+    shown: Path | None,
 ) -> None:
     """Begin to tell how far a run is, with all stages that are known from the start.
 
@@ -98,8 +98,9 @@ def begin_watching(
         Stages of the user's own.
     watchers : Watchers
         Those that the caller brings; the files' are added.
-    shown : Path, optional
-        Folder on a disk where the events are written first, of a run in a bucket.
+    shown : Path or None
+        Folder on a disk where events are written: that of the run, or another one, of a run in a bucket; None for
+        no events.
 
     Raises
     ------
@@ -117,10 +118,10 @@ def begin_watching(
     command = "" if own.stages else command_line(config)  # stages of the user's own are not given by a command
     watchers.add(ProgressFile(out, config, command=command))
     events = out / EVENTS
-    if shown is not None and shown != out:
-        watchers.add(CopiedEvents(events, shown))
-    else:
+    if shown == out:
         watchers.add(EventLog(events, begin_file(events)))
+    elif shown is not None:
+        watchers.add(CopiedEvents(events, shown))
     start = RunStart(
         out=out,
         command=command,
