@@ -1,13 +1,13 @@
 """A function of each of many items, on workers of this machine, with results in the order of the items."""
 
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from pipeline.data.errors import ConfigError
 from tiler.engine.task_limits import Limits, share_memory
 from tiler.executors.dask_executor import ClusterError
 from tiler.executors.dask_settings import ENVIRONMENT
+from tiler.mesh_files.threads import take_in_order
 
 AHEAD = 4  # items for each worker that are submitted before the first of them is taken
 
@@ -54,13 +54,9 @@ def map_in_order(
     from tiler.executors.local_cluster import open_cluster
 
     with open_cluster(workers, Limits(memory=share_memory(workers)), malloc=malloc) as (client, _):
-        waiting: deque[Any] = deque()
         try:
-            for item in items:
-                waiting.append(client.submit(function, item, pure=False))
-                if len(waiting) > AHEAD * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
+            yield from take_in_order(
+                lambda item: client.submit(function, item, pure=False), items, AHEAD * workers
+            )
         except KilledWorker as error:
             raise ClusterError(f"a worker process died ({error.last_worker}); give fewer --workers") from error

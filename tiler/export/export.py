@@ -29,6 +29,7 @@ EXPORT_RECORD = "export.json"  # in every folder that was exported: only such a 
 LARGEST_PART = "largest_part"  # taken by every format of the mesh, not by those of the city model
 CELLS = ("cells", "prism_layers")  # what cells are: tetrahedra, prisms, or both
 ORIGIN = "origin"  # taken by all of these but glb, which has its own
+WORKERS = "workers"  # taken where they save time: docs/formats.md
 PER_BUILDING = ("buildings", LARGEST_PART, ORIGIN)
 
 
@@ -124,6 +125,8 @@ def export_run(
             raise ConfigError(
                 f"--{option.replace('_', '-')}: format {name} does not take it; its options: {taken}"
             )
+    if options.get(WORKERS, 0) < 0:
+        raise ConfigError(f"--workers {options[WORKERS]}: expected 0, for this process, or more")
     asked = options.get("buildings", kind.buildings[0])
     if asked not in kind.buildings:
         raise ConfigError(f"--buildings {asked}: format {name} takes {' or '.join(kind.buildings)}")

@@ -1,5 +1,6 @@
 """Files of OpenFOAM: headers, and long lists in binary, written in any order of their rows."""
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,6 +37,14 @@ def foam_header(name: str, kind: str, *, location: str, binary: bool = False, la
         lines.append(f'    arch        "LSB;label={label};scalar=64";')
     lines += [f"    class       {kind};", f'    location    "{location}";', f"    object      {name};", "}", ""]
     return BANNER + "\n".join(lines) + "\n"
+
+
+def write_at(file: BinaryIO, place: int, data: Any) -> None:
+    """Write bytes, or an array, at a place of a file; other threads may write at others meanwhile."""
+    left = memoryview(data).cast("B") if len(data) else memoryview(b"")
+    while left:
+        n = os.pwrite(file.fileno(), left, place)
+        left, place = left[n:], place + n
 
 
 class FoamList:
@@ -78,8 +87,8 @@ class FoamList:
 
     def write(self, start: int, rows: NDArray[Any]) -> None:
         """Write rows from number `start` on."""
-        self._file.seek(self._start + start * self._width * self._dtype.itemsize)
-        self._file.write(np.ascontiguousarray(rows, self._dtype).data)
+        place = self._start + start * self._width * self._dtype.itemsize
+        write_at(self._file, place, np.ascontiguousarray(rows, self._dtype))
 
     def append(self, rows: NDArray[Any]) -> None:
         """Write rows behind those that were appended before."""
@@ -133,17 +142,16 @@ class FoamFaces:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if error is None:
-            self._seek(self._n)
+            self._file.seek(self._place(self._n))
             self._file.write(b")\n")
         self._file.close()
 
     def write(self, start: int, corners: NDArray[Any]) -> None:
         """Write the vertices (k, 3) of faces from number `start` on."""
-        self._seek(start)
-        self._file.write(np.ascontiguousarray(corners, self._dtype).data)
+        write_at(self._file, self._place(start), np.ascontiguousarray(corners, self._dtype))
 
-    def _seek(self, face: int) -> None:
-        self._file.seek(self._start + 3 * face * self._dtype.itemsize)
+    def _place(self, face: int) -> int:
+        return self._start + 3 * face * self._dtype.itemsize
 
 
 class FoamPolygons:
@@ -170,8 +178,7 @@ class FoamPolygons:
 
     def write(self, start: int, corners: NDArray[Any]) -> None:
         """Write the vertices (k, 4) of faces from number `start` on; triangles end with `NO_CORNER`."""
-        self._wait.seek(4 * start * self._dtype.itemsize)
-        self._wait.write(np.ascontiguousarray(corners, self._dtype).data)
+        write_at(self._wait, 4 * start * self._dtype.itemsize, np.ascontiguousarray(corners, self._dtype))
 
     def _join(self) -> None:
         """Write where each face begins, then the corners of all."""

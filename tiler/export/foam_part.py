@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stitch.pieces.cell_faces import CellFaces
 from tiler.export.cell_parts import CellParts
-from tiler.export.foam_files import POLY_MESH, FoamFaces, FoamList, FoamPolygons, foam_header
+from tiler.export.foam_files import POLY_MESH, FoamFaces, FoamList, FoamPolygons, foam_header, write_at
 from tiler.export.foam_patches import (
     FIRST_LEAVES,
     GROUND_ZONE,
@@ -42,9 +42,11 @@ from tiler.export.region_faces import (
 )
 from tiler.mesh_files.mesh_pieces import MeshPiece
 from tiler.mesh_files.prisms import find_centres
+from tiler.mesh_files.threads import map_threads
 from tiler.mesh_files.transitions import fill_corners, turn_over
 
 DISTANCES = np.logspace(-4, 3, 281)  # m; bins of 6 %
+_Patch = tuple[str, float, float, Ints | None]  # lowest and highest point, and distances, as `PartCounts` has them
 
 
 def no_keys(_: MeshPiece) -> Ints:
@@ -132,7 +134,7 @@ class FoamPlan:
 
 
 class PointPlaces:
-    """Numbers of points within parts that are written one after the other; a file, 8 bytes a point of the region.
+    """Numbers of points within a part; a file with holes, 8 bytes a point of the part.
 
     Parameters
     ----------
@@ -144,19 +146,15 @@ class PointPlaces:
 
     def __init__(self, path: Path, n_points: int) -> None:
         self._place = np.memmap(path, np.int64, "w+", shape=(max(n_points, 1),))
-        self._base = self._end = 0
-
-    def begin_part(self) -> None:
-        """Forget the numbers of the last part."""
-        self._base = self._end
+        self._end = 0
 
     def add(self, ids: Ints) -> tuple[Ints, NDArray[np.bool_]]:
         """Number the points of a piece in the order in which they come; tell also which of them are new."""
-        fresh = self._place[ids] <= self._base
+        fresh = self._place[ids] == 0
         n = int(fresh.sum())
         self._place[ids[fresh]] = self._end + 1 + np.arange(n)
         self._end += n
-        return self._place[ids] - (self._base + 1), fresh
+        return self._place[ids] - 1, fresh
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +186,9 @@ class _Across:
     corners: Ints
 
 
-def write_part(folder: Path, plan: FoamPlan, number: int, places: PointPlaces | None) -> PartCounts:
+def write_part(
+    folder: Path, plan: FoamPlan, number: int, places: PointPlaces | None, *, threads: int = 0
+) -> PartCounts:
     """Write the polyMesh of one part.
 
     Parameters
@@ -202,12 +202,14 @@ def write_part(folder: Path, plan: FoamPlan, number: int, places: PointPlaces | 
     places : PointPlaces, optional
         Numbers of points in parts. If not given, there is one part, the whole mesh, and points keep the region's
         numbers.
+    threads : int
+        How many write pieces of the whole mesh; with less than 2 this one does.
     """
     (folder / POLY_MESH).mkdir(parents=True)
     with ExitStack() as stack:
         writer = _PartWriter(folder / POLY_MESH, plan, number, places, stack)
-        for k in writer.numbers.pieces:
-            writer.add(k)
+        for found in map_threads(writer.add, writer.numbers.pieces, 0 if places else threads):
+            writer.count(*found)
         return writer.finish()
 
 
@@ -235,7 +237,6 @@ class _PartWriter:
         self._points = self._open("points", n=n_points, kind="vectorField", dtype="f8", width=3)
         self._owner, self._neighbour = self._open("owner", n=n), self._open("neighbour", n=numbers.n_inner)
         if places is not None:
-            places.begin_part()
             self._point_to, self._cell_to = self._open("pointProcAddressing"), self._open("cellProcAddressing")
             self._face_to = self._open("faceProcAddressing", n=n)
             self._whole = _number_facets(plan.patches, range(len(plan.pieces.names)), plan.region.n_inner)
@@ -252,8 +253,8 @@ class _PartWriter:
         if plan.heights is not None:
             self._heights = stack.enter_context((plan.heights / str(number)).open("wb"))
 
-    def add(self, k: int) -> None:
-        """Write what is in the part of piece `k`."""
+    def add(self, k: int) -> tuple[list[_Patch], Counter[int]]:
+        """Write what is in the part of piece `k`; returns what `count` takes."""
         piece = self._plan.pieces.read(k)
         faces = faces_of_piece(piece)
         start = int(self._plan.region.cell_start[k])
@@ -262,18 +263,31 @@ class _PartWriter:
             cells = start + np.flatnonzero(self._plan.parts.part[cells] == self.numbers.number)
         local = self._add_points(k, piece, cells)
         self._add_inner(k, piece, faces, local)
-        self._add_facets(k, piece, faces, local)
+        patches, leaves = self._add_facets(k, piece, faces, local), Counter[int]()
         if self._volumes is not None:
             number = np.arange(cells.start, cells.stop) if isinstance(cells, slice) else cells
             keys = self._plan.volume_keys(piece)[number - start]
             write_volumes(self._volumes, k, keys, self._plan.parts.place_of(number))
-            self._leaves.update(keys[keys >= FIRST_LEAVES].tolist())
-        if self._heights is not None:
-            rows = slice(0, len(piece.cells)) if isinstance(cells, slice) else cells - start
-            find_centres(piece.points[:, 2:], piece.cells[rows]).tofile(self._heights)
+            leaves.update(keys[keys >= FIRST_LEAVES].tolist())
+        rows = slice(0, len(piece.cells)) if isinstance(cells, slice) else cells - start
+        if self._heights is not None and len(mine := piece.cells[rows]):
+            first = cells.start if isinstance(cells, slice) else int(self._plan.parts.place_of(cells[:1])[0])
+            write_at(self._heights, 8 * first, find_centres(piece.points[:, 2:], mine))
             if piece.leaves is not None and self._plan.heights is not None:
-                with leaves_beside(self._plan.heights / str(self.numbers.number)).open("ab") as file:
-                    piece.leaves[rows].astype("<f8").tofile(file)
+                path = leaves_beside(self._plan.heights / str(self.numbers.number))
+                path.touch()
+                with path.open("r+b") as file:
+                    write_at(file, 8 * first, piece.leaves[rows].astype("<f8"))
+        return patches, leaves
+
+    def count(self, patches: list[_Patch], leaves: Counter[int]) -> None:
+        """Count what a piece has, piece after piece."""
+        self._leaves.update(leaves)
+        for name, low, high, near in patches:
+            self._lowest[name] = min(self._lowest.get(name, np.inf), low)
+            self._highest[name] = max(self._highest.get(name, -np.inf), high)
+            if near is not None:
+                self._near[name] = self._near.get(name, 0) + near
 
     def finish(self) -> PartCounts:
         """Write what stands behind the pieces."""
@@ -340,11 +354,13 @@ class _PartWriter:
             return mine
 
         ground = [np.empty(0, np.int64)]
+        start = self._row if self._places is not None else int(region.face_start[k])
         for own in own_faces(region, k, piece, faces, None if self._places is None else is_mine):
             is_ground = find_ground(region, k, piece, own)
-            inside = self._add_block(own, local)
-            ground.append(self._row + np.cumsum(inside)[is_ground] - 1)
-            self._row += int(inside.sum())
+            inside = self._add_block(own, local, start)
+            ground.append(start + np.cumsum(inside)[is_ground] - 1)
+            start += int(inside.sum())
+        self._row = start
         if self._places is not None:
             self._across.append(self._find_turned(k, piece, faces, local))
         if piece.region is None:
@@ -355,17 +371,17 @@ class _PartWriter:
         if self._zones is not None and len(rows):
             self._zones.write(k, np.full(len(rows), GROUND_ZONE), rows)
 
-    def _add_block(self, own: OwnFaces, local: Ints) -> NDArray[np.bool_]:
-        """Write faces of a piece; returns which are inside the part."""
+    def _add_block(self, own: OwnFaces, local: Ints, start: int) -> NDArray[np.bool_]:
+        """Write faces of a piece from number `start` on; returns which are inside the part."""
         parts, number = self._plan.parts, self.numbers.number
         low, high = parts.part_of(own.owner), parts.part_of(own.neighbour)
         corners = number_corners(local, own.corners)
         inside: NDArray[np.bool_] = (low == number) & (high == number)
-        self._faces.write(self._row, corners[inside])
-        self._owner.write(self._row, parts.place_of(own.owner[inside]))
-        self._neighbour.write(self._row, parts.place_of(own.neighbour[inside]))
+        self._faces.write(start, corners[inside])
+        self._owner.write(start, parts.place_of(own.owner[inside]))
+        self._neighbour.write(start, parts.place_of(own.neighbour[inside]))
         if self._places is not None:
-            self._face_to.write(self._row, own.number[inside] + 1)
+            self._face_to.write(start, own.number[inside] + 1)
             out = ~inside
             # Of a face whose lower cell is in another part the upper one is the owner here, so it is turned.
             turned = high[out] == number
@@ -388,8 +404,9 @@ class _PartWriter:
         face = np.asarray(region.face[rows[turned]])
         return _Across(other, face, np.ones(len(face), np.bool_), parts.place_of(cell[turned]), corners)
 
-    def _add_facets(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
+    def _add_facets(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> list[_Patch]:
         """Write the facets of the part's cells in a piece, each where its patch has room for them."""
+        found: list[_Patch] = []
         numbers, keys = self.numbers, self._plan.patches.keys
         outer = find_outer(piece)
         facets, cell = piece.facets[outer], faces.facet_cell + self._plan.region.cell_start[k]
@@ -410,14 +427,14 @@ class _PartWriter:
                 self._face_to.write(at, int(start[row]) + first[k][row] + 1 + in_piece)
             patch, faced = patch_of_key(int(keys[row]), self._plan.pieces.ground), facets[chosen]
             name, height = patch.name, piece.points[fill_corners(faced), 2]
-            self._lowest[name] = min(self._lowest.get(name, np.inf), float(height.min()))
-            self._highest[name] = max(self._highest.get(name, -np.inf), float(height.max()))
+            near = None
             if patch.kind == "wall":
                 centres = find_centres(piece.points, piece.cells[faces.facet_cell[chosen]])
                 near = count_distances(centres, piece.points, faced)
-                self._near[name] = self._near.get(name, 0) + near
+            found.append((name, float(height.min()), float(height.max()), near))
         if self._zones is not None:
             self._zones.write(k, np.where(mine, self._plan.zone_keys(piece)[outer], -1), face)
+        return found
 
     def _add_across(self) -> None:
         """Write the faces towards other parts: by part, then by number over the region, so in its order too."""
@@ -431,7 +448,6 @@ class _PartWriter:
         self._owner.write(at, owner[order])
         self._face_to.write(at, (np.where(turned, -1, 1) * (face + 1))[order])
         if self._heights is not None and self._plan.heights is not None:
-            self._heights.flush()
             height = np.fromfile(self._plan.heights / str(self.numbers.number))[owner[order]]
             for beyond in self.numbers.others:
                 place = self._plan.heights / f"{self.numbers.number}-{beyond}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.mesh import GROUND_PATCHES, Marker
 from pipeline.data.regions import Region
-from tiler.export.foam_files import POLY_MESH, foam_header
+from tiler.export.foam_files import POLY_MESH, foam_header, write_at
 from tiler.export.region_faces import FacetSets, Ints
 
 PATCHES = {
@@ -279,8 +279,7 @@ class ZonesFile:
         """Write which faces or cells of piece `k` are in the zones `keys`, -1 for none."""
         for row, chosen in runs_of(self._keys, keys):
             lines = "".join(f"{number:>{WIDTH - 1}d}\n" for number in numbers[chosen].tolist())
-            self._file.seek(int(self._start[row]) + self._first[k][row] * WIDTH)
-            self._file.write(lines.encode())
+            write_at(self._file, int(self._start[row]) + self._first[k][row] * WIDTH, lines.encode())
 
 
 def runs_of(keys: Ints, of_facet: Ints) -> list[tuple[int, NDArray[np.int64]]]:

@@ -22,6 +22,7 @@ from stitch.pieces.cell_faces import CellFaces, find_cell_faces
 from stitch.pieces.conformity import group_rows
 from tiler.export.pieces import Pieces
 from tiler.mesh_files.mesh_pieces import MeshPiece
+from tiler.mesh_files.threads import map_threads
 from tiler.mesh_files.transitions import NO_CORNER
 
 Ints = NDArray[np.int64]
@@ -134,7 +135,12 @@ NOTHING = Waiting(np.empty((0, 0), np.int64), np.empty(0, np.int64))
 
 
 def survey_faces(
-    pieces: Pieces, folder: Path, *, kinds: tuple[SetsOf, ...], look: Callable[[MeshPiece], None] | None = None
+    pieces: Pieces,
+    folder: Path,
+    *,
+    kinds: tuple[SetsOf, ...],
+    look: Callable[[MeshPiece], None] | None = None,
+    threads: int = 0,
 ) -> tuple[RegionFaces, list[FacetSets]]:
     """Read all pieces once, and number cells, faces and facets.
 
@@ -147,7 +153,9 @@ def survey_faces(
     kinds : tuple of callable
         Each gives a key for every facet of a piece, or for every cell, or -1 for none.
     look : callable, optional
-        Is given each piece too.
+        Is given each piece too, in their order: this thread alone then reads them.
+    threads : int
+        How many read pieces and find their faces; with less than 2 this one does.
 
     Returns
     -------
@@ -163,30 +171,37 @@ def survey_faces(
 
     Notes
     -----
-    Memory: one piece, the shared faces of the pieces that wait for a later one (32 bytes each) and the number of
-    facets that each piece has of each set. Files: 40 bytes a shared face.
+    Memory: one piece a thread, the shared faces of the pieces that wait for a later one (32 bytes each) and the
+    number of facets that each piece has of each set. Files: 40 bytes a shared face.
     """
     n = len(pieces.names)
     n_cells, n_faces, n_shared = (np.zeros(n, np.int64) for _ in range(3))
     centre = np.empty((n, 2))
-    counts: list[list[dict[int, int]]] = [[] for _ in kinds]
+    counts: list[list[dict[int, int]]] = [[{} for _ in range(n)] for _ in kinds]
     waiting = NOTHING
     paths = [folder / name for name in ("cells", "before", "mates")]
+
+    def find_shared(k: int) -> tuple[NDArray[np.int32], Ints, Ints]:
+        """Count what piece `k` has; gives of its shared faces cells, how many faces come before, and corners."""
+        piece = pieces.read(k)
+        if look is not None:
+            look(piece)
+        faces = faces_of_piece(piece)
+        n_cells[k], n_faces[k], n_shared[k] = len(piece.cells), len(faces.owner), len(faces.shared)
+        centre[k] = (piece.points[:, :2].min(axis=0) + piece.points[:, :2].max(axis=0)) / 2
+        for of_kind, sets_of in zip(counts, kinds, strict=True):
+            keys, count = np.unique(sets_of(piece), return_counts=True)
+            of_kind[k] = {key: c for key, c in zip(keys.tolist(), count.tolist(), strict=True) if key >= 0}
+        before = np.searchsorted(faces.owner, faces.shared_cell, side="right")
+        return faces.shared_cell, before, number_corners(piece.ids, faces.shared)
+
     with paths[0].open("wb") as cells_file, paths[1].open("wb") as before_file, paths[2].open("wb") as mates_file:
-        for k in range(n):
-            piece = pieces.read(k)
-            if look is not None:
-                look(piece)
-            faces = faces_of_piece(piece)
-            n_cells[k], n_faces[k], n_shared[k] = len(piece.cells), len(faces.owner), len(faces.shared)
-            centre[k] = (piece.points[:, :2].min(axis=0) + piece.points[:, :2].max(axis=0)) / 2
-            for found, sets_of in zip(counts, kinds, strict=True):
-                keys, count = np.unique(sets_of(piece), return_counts=True)
-                found.append({key: c for key, c in zip(keys.tolist(), count.tolist(), strict=True) if key >= 0})
-            (faces.shared_cell + n_cells[:k].sum()).astype(np.int64).tofile(cells_file)
-            np.searchsorted(faces.owner, faces.shared_cell, side="right").astype(np.int64).tofile(before_file)
+        found = map_threads(find_shared, range(n), threads if look is None else 0)
+        for k, (cell, before, corners) in enumerate(found):
+            (cell + n_cells[:k].sum()).astype(np.int64).tofile(cells_file)
+            before.astype(np.int64).tofile(before_file)
             rows = n_shared[:k].sum() + np.arange(n_shared[k])
-            waiting, mates = meet(waiting, number_corners(piece.ids, faces.shared), rows, piece.name)
+            waiting, mates = meet(waiting, corners, rows, pieces.names[k])
             mates.tofile(mates_file)
     if len(waiting.row):
         k = int(np.searchsorted(np.cumsum(n_shared), waiting.row[0], side="right"))

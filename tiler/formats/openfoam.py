@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.data.errors import CityError, ConfigError, InputError
 from pipeline.data.regions import Region
 from tiler.export.cell_parts import ColumnsFile, divide_cells, take_whole
-from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, ORIGIN, Format
+from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, ORIGIN, WORKERS, Format
 from tiler.export.foam_case import write_system
 from tiler.export.foam_files import LABEL_LIMIT
 from tiler.export.foam_part import DISTANCES, FoamPlan, PartCounts, PointPlaces, write_part
@@ -32,6 +32,7 @@ from tiler.export.wind_profile import PEDESTRIAN_HEIGHT, Wind, WindWords, make_w
 from tiler.mesh_files.air import open_air
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.run_files import RunFiles, RunSource, crs_of
+from tiler.mesh_files.threads import map_threads
 from tiler.store.atomic import replacing_folder
 
 # Roughness lengths between rough ground and the centres of its cells. Over bare ground the profile stays within
@@ -50,6 +51,7 @@ def export_openfoam(
     buildings: str | None = None,
     cells: str | None = None,
     prism_layers: int | None = None,
+    workers: int = 0,
     **wind: Unpack[WindWords],
 ) -> list[str]:
     """Write a case folder of OpenFOAM from a finished run.
@@ -68,6 +70,8 @@ def export_openfoam(
         Write prisms instead of tetrahedra; see `tiler.export.prism_pieces.open_prisms`, also for memory.
     prism_layers : int, optional
         Of a hybrid mesh.
+    workers : int
+        See `write_openfoam`.
     **wind
         See `tiler.export.wind_profile.Wind`.
 
@@ -106,7 +110,9 @@ def export_openfoam(
         if heights is not None:
             heights.mkdir()
         combined = pieces if cells is None else open_prisms(pieces, cells, prism_layers, Path(name))
-        counts = write_openfoam(folder, combined, parts=parts, buildings=buildings, heights=heights)
+        counts = write_openfoam(
+            folder, combined, parts=parts, buildings=buildings, heights=heights, threads=workers
+        )
         if heights is None:
             write_system(folder, parts=parts)
         else:
@@ -194,6 +200,7 @@ def write_openfoam(
     parts: int | None = None,
     buildings: str | None = None,
     heights: Path | None = None,
+    threads: int = 0,
 ) -> list[PartCounts]:
     """Write a mesh as OpenFOAM reads it.
 
@@ -209,6 +216,8 @@ def write_openfoam(
         Give each building, walls and roofs, a patch of its own, or a face zone beside the patches.
     heights : Path, optional
         An existing folder to write the heights of the centres of cells to; see `FoamPlan`.
+    threads : int
+        How many read and write pieces of the whole mesh, or write parts; with less than 2 this one does.
 
     Returns
     -------
@@ -224,10 +233,10 @@ def write_openfoam(
 
     Notes
     -----
-    Memory: one piece with its faces (some 80 bytes a cell), the faces between one part and the others (some
-    60 bytes each), and what `survey_faces` holds. Files beside the result, gone at the end: 40 bytes a face
-    between two tiles; for parts also 8 bytes a point, 12 a cell and 24 a column. Each piece is read twice; for
-    parts twice, and once more for each part that has cells of it.
+    Memory: for each thread one piece with its faces (some 80 bytes a cell), the faces between one part and the
+    others (some 60 bytes each), and what `survey_faces` holds. Files beside the result, gone at the end: 40 bytes
+    a face between two tiles; for parts also 8 bytes a point, 12 a cell and 24 a column. Each piece is read twice;
+    for parts twice, and once more for each part that has cells of it.
     """
     if parts is not None and parts < 1:
         raise ConfigError(f"--parts {parts}: must be 1 or more")
@@ -238,7 +247,7 @@ def write_openfoam(
         columns = ColumnsFile(scratch / "columns")
         look = None if parts is None else columns.add
         region, (patches, zones, volumes) = survey_faces(
-            pieces, scratch, kinds=(sets_of, zones_of, _by_volume), look=look
+            pieces, scratch, kinds=(sets_of, zones_of, _by_volume), look=look, threads=threads
         )
         if parts is None:
             divided = take_whole(region, (patches, zones, volumes))
@@ -267,9 +276,13 @@ def write_openfoam(
             polygons,
         )
         if parts is None:
-            return [write_part(folder, plan, 0, None)]
-        places = PointPlaces(scratch / "places", pieces.n_points)
-        return [write_part(folder / f"processor{number}", plan, number, places) for number in range(parts)]
+            return [write_part(folder, plan, 0, None, threads=threads)]
+
+        def write(number: int) -> PartCounts:
+            places = PointPlaces(scratch / f"places{number}", pieces.n_points)
+            return write_part(folder / f"processor{number}", plan, number, places)
+
+        return list(map_threads(write, range(parts), threads))
 
 
 def _by_marker(piece: MeshPiece) -> Ints:
@@ -300,7 +313,7 @@ def _by_volume(piece: MeshPiece) -> Ints:
 FORMAT = Format(
     "a case folder of OpenFOAM",
     export_openfoam,
-    options=("parts", "case", *WIND_OPTIONS, "buildings", *CELLS, LARGEST_PART, ORIGIN),
+    options=("parts", "case", *WIND_OPTIONS, "buildings", *CELLS, LARGEST_PART, ORIGIN, WORKERS),
     buildings=("patches", "zones"),
     folder=True,
 )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.export.export import CELLS, LARGEST_PART, ORIGIN, Format
+from tiler.export.export import CELLS, LARGEST_PART, ORIGIN, WORKERS, Format
 from tiler.mesh_files.merged import TILE, write_merged_volume
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
@@ -27,15 +27,16 @@ def export_vtu(
     cells: str | None = None,
     prism_layers: int | None = None,
     scalars: bool = False,
+    workers: int = 0,
 ) -> None:
     """Write the volume of a finished run, as `tiler.mesh_files.merged.write_merged_volume` does, or as prisms."""
     if cells is not None:
-        write_prisms(path, read_prisms(open_pieces(files), cells, prism_layers), scalars=scalars)
+        write_prisms(path, read_prisms(open_pieces(files), cells, prism_layers), scalars=scalars, threads=workers)
     else:
-        write_merged_volume(path, files.volumes, scalars=scalars, origin=files.origin)
+        write_merged_volume(path, files.volumes, scalars=scalars, origin=files.origin, threads=workers)
 
 
-def write_prisms(path: Path, mesh: PrismMesh, *, scalars: bool = False) -> None:
+def write_prisms(path: Path, mesh: PrismMesh, *, scalars: bool = False, threads: int = 0) -> None:
     """Write prisms as VTK's wedges, with other cells; `scalars` adds the cell array of tiles."""
     n, width = len(mesh.cells), mesh.widths
     corners = mesh.cells[mesh.cells != NO_CORNER]
@@ -57,7 +58,7 @@ def write_prisms(path: Path, mesh: PrismMesh, *, scalars: bool = False) -> None:
         "CellData": tiles,
     }
     counts = {"NumberOfPoints": len(mesh.points), "NumberOfCells": n}
-    write_data_file(path, "UnstructuredGrid", counts, sections)
+    write_data_file(path, "UnstructuredGrid", counts, sections, threads=threads)
 
 
 def _stream(name: str, values: NDArray[Any], dtype: np.dtype[Any], *, components: int = 1) -> Stream:
@@ -65,4 +66,8 @@ def _stream(name: str, values: NDArray[Any], dtype: np.dtype[Any], *, components
     return stream_items(name, dtype, components, len(flat), lambda i, j: flat[i:j])
 
 
-FORMAT = Format("the volume mesh as one VTK file", export_vtu, options=("scalars", *CELLS, LARGEST_PART, ORIGIN))
+FORMAT = Format(
+    "the volume mesh as one VTK file",
+    export_vtu,
+    options=("scalars", *CELLS, LARGEST_PART, ORIGIN, WORKERS),
+)

@@ -52,7 +52,7 @@ class _Source:
 
 
 def write_merged_volume(
-    path: Path, pieces: Sequence[Path], *, scalars: bool = False, origin: Place = NO_PLACE
+    path: Path, pieces: Sequence[Path], *, scalars: bool = False, origin: Place = NO_PLACE, threads: int = 0
 ) -> None:
     """Write one VTU file of many.
 
@@ -64,6 +64,8 @@ def write_merged_volume(
         VTU pieces (`tiler.mesh_files.vtk_files`) with the int64 point array `VERTEX_ID`: each id for one place.
     scalars : bool
         Add cell arrays to colour by: `TILE`, and `RADIUS_RATIO` as `pipeline.quality.quality` measures it.
+    threads : int
+        How many pack what is written; with less than 2 this one does.
 
     Raises
     ------
@@ -81,7 +83,7 @@ def write_merged_volume(
     9 bytes a vertex; coordinates are in a file that the system maps. Each piece is read twice, and again for each
     of its arrays.
     """
-    _write(path, pieces, pieces, "UnstructuredGrid", scalars=scalars, origin=origin)
+    _write(path, pieces, pieces, "UnstructuredGrid", scalars=scalars, origin=origin, threads=threads)
 
 
 def write_merged_boundary(
@@ -157,13 +159,20 @@ def number_piece(path: Path, ids: NDArray[Any] | None, numbering: Numbering) -> 
 
 
 def _write(
-    path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str, *, scalars: bool, origin: Place
+    path: Path,
+    pieces: Sequence[Path],
+    volumes: Sequence[Path],
+    kind: str,
+    *,
+    scalars: bool,
+    origin: Place,
+    threads: int = 0,
 ) -> None:
     if not pieces:
         raise ValueError("a merged file needs at least one piece")
     with disk_errors(path), TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
         gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder), origin)
-        _write_file(path, kind, *gathered, scalars=scalars)
+        _write_file(path, kind, *gathered, scalars=scalars, threads=threads)
 
 
 def _write_file(
@@ -174,6 +183,7 @@ def _write_file(
     xyz: NDArray[np.float64],
     *,
     scalars: bool,
+    threads: int,
 ) -> None:
     rows = [_connectivity(source, kind, numbers), stream_offsets(int(source.n_rows.sum()), source.width)]
     arrays = source.read(0)["CellData"]
@@ -194,7 +204,7 @@ def _write_file(
         sections["PointData"].append(_flat("vertex", numbers, 1))
         counts = {"NumberOfPoints": len(xyz), "NumberOfVerts": 0, "NumberOfLines": 0}
         counts |= {"NumberOfStrips": 0, "NumberOfPolys": n_rows}
-    write_data_file(path, kind, counts, sections)
+    write_data_file(path, kind, counts, sections, threads=threads)
 
 
 def _gather(

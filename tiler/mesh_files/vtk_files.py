@@ -333,7 +333,7 @@ def _items(rows: Rows) -> Callable[[int, int], NDArray[Any]]:
 def stream_offsets(n_rows: int, width: int) -> Stream:
     """Make the stream of where rows of so many numbers end in the connectivity."""
     dtype = np.dtype(np.int32 if n_rows * width < 2**31 else np.int64)
-    return Stream("offsets", dtype, 1, n_rows, partial(_give_ends, width, dtype, n_rows))
+    return Stream("offsets", dtype, 1, n_rows, partial(partial, _give_ends, width, dtype, n_rows))
 
 
 def _give_ends(width: int, dtype: np.dtype[Any], n_rows: int, i: int, j: int) -> bytes:
@@ -351,7 +351,7 @@ _kept_ends = lru_cache(maxsize=None)(_compress_ends)
 
 def stream_types(n_cells: int) -> Stream:
     """Make the stream of the types of tetrahedra."""
-    return Stream("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: _compress_types(j - i))
+    return Stream("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: partial(_compress_types, j - i))
 
 
 @lru_cache(maxsize=2)  # a full block, and the last one

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 from xml.sax.saxutils import quoteattr
@@ -20,6 +21,7 @@ from deflate import DeflateError, zlib_compress, zlib_decompress
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
+from tiler.mesh_files.threads import map_threads
 from tiler.objects.places import read_at_most
 from tiler.store.atomic import replacing
 
@@ -46,13 +48,16 @@ DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in VTK_TYPES.i
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """One array on its way to the disk: ``block(i, j)`` makes its numbers ``i`` to ``j``, compressed."""
+    """One array on its way to the disk: ``block(i, j)`` takes its numbers ``i`` to ``j``.
+
+    It gives what packs them, perhaps in another thread.
+    """
 
     name: str
     dtype: np.dtype[Any]
     components: int
     n_items: int
-    block: Callable[[int, int], bytes]
+    block: Callable[[int, int], Callable[[], bytes]]
 
 
 Sections = dict[str, list[Stream]]
@@ -70,7 +75,7 @@ def stream_items(
     name: str, dtype: np.dtype[Any], components: int, n_items: int, items: Callable[[int, int], NDArray[Any]]
 ) -> Stream:
     """Make a stream of numbers that ``items(i, j)`` makes, to be written as `dtype`."""
-    return Stream(name, dtype, components, n_items, lambda i, j: compress_block(items(i, j), dtype))
+    return Stream(name, dtype, components, n_items, lambda i, j: partial(compress_block, items(i, j), dtype))
 
 
 def compress_block(items: NDArray[Any], dtype: np.dtype[Any], *, level: int = LEVEL) -> bytes:
@@ -78,8 +83,12 @@ def compress_block(items: NDArray[Any], dtype: np.dtype[Any], *, level: int = LE
     return bytes(zlib_compress(items.astype(dtype.newbyteorder("<"), copy=False).tobytes(), level))
 
 
-def write_data_file(path: Path, kind: str, counts: Mapping[str, int], sections: Sections) -> None:
+def write_data_file(
+    path: Path, kind: str, counts: Mapping[str, int], sections: Sections, *, threads: int = 0
+) -> None:
     """Write a file of one piece: ``counts`` are the piece's attributes, ``kind`` is VTK's data set type.
+
+    Blocks are packed by so many threads, as they come; the bytes are the same.
 
     Raises
     ------
@@ -100,7 +109,7 @@ def write_data_file(path: Path, kind: str, counts: Mapping[str, int], sections: 
             offsets.append(file.tell() - start)
             taken.add(start + unpacked)
             unpacked += 4 * -(-(8 + stream.n_items * stream.dtype.itemsize) // 3)
-            _write_blocks(file, stream, taken)
+            _write_blocks(file, stream, taken, threads)
         file.write(b"\n  </AppendedData>\n</VTKFile>\n")
         file.seek(0)
         file.write(_render(kind, counts, sections, offsets))
@@ -139,7 +148,7 @@ def _declaration(vtk_type: str, name: str, components: str) -> str:
     return f"type={quoteattr(vtk_type)} Name={quoteattr(name)}{width}"
 
 
-def _write_blocks(file: BinaryIO, stream: Stream, taken: Collection[int]) -> None:
+def _write_blocks(file: BinaryIO, stream: Stream, taken: Collection[int], threads: int) -> None:
     """Write one array: its table of block sizes, then its blocks; the table is filled in afterwards.
 
     It ends at none of the places that are taken.
@@ -151,10 +160,10 @@ def _write_blocks(file: BinaryIO, stream: Stream, taken: Collection[int]) -> Non
     table[:3] = n_blocks, BLOCK_BYTES, stream.n_items * dtype.itemsize % BLOCK_BYTES
     start = file.tell()
     file.write(table.tobytes())
-    for k in range(n_blocks):
-        block = stream.block(k * step, min((k + 1) * step, stream.n_items))
-        if k == n_blocks - 1:
-            block = _end_elsewhere(block, {end - file.tell() for end in taken})
+    blocks = (stream.block(k * step, min((k + 1) * step, stream.n_items)) for k in range(n_blocks))
+    for k, packed in enumerate(map_threads(lambda pack: pack(), blocks, threads)):
+        last = k == n_blocks - 1
+        block = _end_elsewhere(packed, {end - file.tell() for end in taken}) if last else packed
         table[3 + k] = len(block)
         file.write(block)
     end = file.tell()
