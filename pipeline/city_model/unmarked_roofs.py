@@ -72,8 +72,8 @@ def find_bare(points: RoofPoints, polygons: NDArray[np.object_]) -> Mask:
     if len(rows) == 0:
         return bare
     house = np.repeat(np.arange(len(polygons)), count)[rows]
-    keys = _cell_keys(points.xyz[rows], house, np.full(len(polygons), MARK_CELL))
-    cells = np.bincount(house[np.unique(keys, return_index=True)[1]], minlength=len(polygons))
+    keys = np.sort(_cell_keys(points.xyz[rows], house, np.full(len(polygons), MARK_CELL)))  # by house, as they were
+    cells = np.bincount(house[np.diff(keys, prepend=-1) > 0], minlength=len(polygons))
     bare |= thin & (cells * MARK_CELL**2 < MARKED_SHARE * area)
     return bare
 

@@ -151,6 +151,8 @@ def add_roof_points(points: RoofPoints, rows: NDArray[np.int64], more: RoofPoint
     >>> found.start.tolist(), found.z.tolist()
     ([0, 1, 3], [9.0, 4.0, 5.0])
     """
+    if len(rows) == 0:
+        return points
     old, new = np.diff(points.start), np.diff(more.start)
     owner = np.concatenate((np.repeat(np.arange(len(old)), old), np.repeat(rows, new)))
     order = np.argsort(owner, kind="stable")
