@@ -15,6 +15,7 @@ from pipeline.data.classes import (
     NEVER_ROOF,
     WATER,
 )
+from pipeline.data.kernel import kernel
 from pipeline.data.pointcloud import N_CLASSES, PointCloud
 from pipeline.geometry.inside import are_inside, find_inside
 from pipeline.points_terrain.raster import Dtm, sample_dtm
@@ -66,16 +67,25 @@ def find_bare(points: RoofPoints, polygons: NDArray[np.object_]) -> Mask:
         True where they lie in less than a fifth of its square metres.
     """
     count, area = np.diff(points.start), shapely.area(polygons)
-    bare: Mask = count == 0
-    thin = ~bare & (count < DENSE * area)
-    rows = np.flatnonzero(np.repeat(thin, count))
-    if len(rows) == 0:
-        return bare
-    house = np.repeat(np.arange(len(polygons)), count)[rows]
-    keys = np.sort(_cell_keys(points.xyz[rows], house, np.full(len(polygons), MARK_CELL)))  # by house, as they were
-    cells = np.bincount(house[np.diff(keys, prepend=-1) > 0], minlength=len(polygons))
-    bare |= thin & (cells * MARK_CELL**2 < MARKED_SHARE * area)
+    thin = (count > 0) & (count < DENSE * area)
+    cells = _count_cells(points.start, points.xyz, thin)
+    bare: Mask = (count == 0) | (thin & (cells * MARK_CELL**2 < MARKED_SHARE * area))
     return bare
+
+
+@kernel
+def _count_cells(start: Index, xyz: Array, among: Mask) -> Index:
+    """Count the cells of side `MARK_CELL` in which some houses have points; 0 for others."""
+    cells = np.zeros(len(among), np.int64)
+    for house in np.flatnonzero(among):
+        keys = np.empty(start[house + 1] - start[house], np.int64)
+        for k in range(len(keys)):
+            x, y = xyz[start[house] + k, :2] / MARK_CELL
+            keys[k] = int(np.floor(y)) * 2**32 + int(np.floor(x))
+        keys.sort()
+        for k in range(len(keys)):
+            cells[house] += k == 0 or keys[k] != keys[k - 1]
+    return cells
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,7 @@ from tiler.pointclouds.ingest import CELL
 from tiler.store.result_file import CHUNK_BYTES
 
 CHUNK_ROWS = CHUNK_BYTES // 12  # of coordinates in the store, three units of 4 bytes each
-BAND = 3 * CHUNK_ROWS  # rows of points that are read at a time, 1.05 million
+BAND = CHUNK_ROWS  # rows of points that are read at a time, 0.35 million
 CLASSES = 256  # that a point may have
 
 Ranges = list[tuple[int, int]]  # first row and the one behind the last, ascending and apart from each other
