@@ -18,7 +18,8 @@ from tiler.wind.results import Floats, WindCase, open_case, read_table, sampled_
 
 FIELDS = {"U": 6, "k": 4, "epsilon": 4}  # numbers of a row: its place and its value
 LEVEL = 0.05  # m; 5 % of the speed at 0.5 m
-ROW = 1.05  # faces of one row of the table: highest over lowest height
+ROW = 1.05  # faces of one row of the table: highest over lowest height, unless it has few faces
+FEW = 0.02  # of all
 
 
 def write_outlet_profile(directory: Path, path: Path, *, overwrite: bool = False) -> list[str]:
@@ -85,11 +86,12 @@ def _find_ground(case: WindCase) -> float:
 
 
 def _read_outlet(case: WindCase, ground: float) -> Floats:
-    """Return the means of the faces by which the wind leaves, (n, 4) as `COLUMNS`; of heights within `ROW`."""
+    """Return the means of the faces by which the wind leaves, by height, (n, 4) as `COLUMNS`."""
     (direction,) = case.wind.directions
     fields = {name: read_table(sampled_file(case, direction, f"{name}_{OUTLET}"), n) for name, n in FIELDS.items()}
     height = fields["U"][:, 2] - ground
     speed = fields["U"][:, 3:] @ (*flow_of(direction), 0.0)
-    _, row = np.unique((np.log(height / height.min()) / np.log(ROW) + 1e-6).astype(int), return_inverse=True)
+    step = (np.log(height / height.min()) / np.log(ROW) + 1e-6).astype(int)
+    row = np.unique((np.cumsum(np.bincount(step)) - 1)[step] // (FEW * len(step)), return_inverse=True)[1]
     columns = (height, speed, fields["k"][:, 3], fields["epsilon"][:, 3])
     return np.column_stack([np.bincount(row, column) for column in columns]) / np.bincount(row)[:, None]
