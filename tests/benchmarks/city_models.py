@@ -1,4 +1,8 @@
-"""`python -m tests.benchmarks.city_models`: published city models meshed, as rows of docs/city-models.md."""
+"""`python -m tests.benchmarks.city_models`: published city models meshed, as rows of docs/city-models.md.
+
+With `--all` each sample is also meshed in two more tilings, which must give the same city, exported in all formats
+and converted to all; each of the three runs is proved by `check` with either.
+"""
 
 import argparse
 import json
@@ -8,8 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from tests.runs.test_city_model_samples import city_of
+from tests.tiler.convert.test_convert import validate_gml
 from tiler.check.check import check_run
 from tiler.config.config import make_config
+from tiler.convert.convert import TARGETS, Asked, convert_models
+from tiler.export.export import export_run, list_formats, load_format
 from tiler.store.results import StoredTerrain
 from tiler.workflow.run import run
 
@@ -68,23 +76,57 @@ def describe(name: str, record: dict[str, Any], out: Path) -> str:
     )
 
 
+def prove(values: dict[str, Any], out: Path) -> dict[str, Any]:
+    """Mesh, and prove what was written; gives the record."""
+    record = run(make_config(values | {"out": str(out), "overwrite": True}))
+    if not (proved := check_run(out, StoredTerrain)).ok:
+        print(*proved.lines(), sep="\n", flush=True)
+    return record
+
+
+def try_all(values: dict[str, Any], record: dict[str, Any], folder: Path) -> str:
+    """Mesh in two more tilings, export and convert; gives what there was of each, as words."""
+    box = record["region"]["bounds"]
+    side = max(box[2] - box[0], box[3] - box[1])
+    cities, tiles = [city_of(folder / "out")], [record["counts"]["tiles"]]
+    finer = {"mesh_size": min(record["parameters"]["mesh_size"], side / 38)}  # a tile has 14 of them at least
+    for share in (0.55, 0.4):
+        other = prove(values | finer | {"tile_size": share * side}, folder / "other")
+        cities.append(city_of(folder / "other"))
+        tiles.append(other["counts"]["tiles"])
+    same = sum(one == cities[0] for one in cities)
+    for name in list_formats():
+        export_run(folder / "out", folder / f"export-{name}{load_format(name).suffix}", name=name, options={})
+    for name, target in TARGETS.items():
+        path = folder / f"{name}{target.suffixes[0]}"
+        convert_models([folder / "out"], path, Asked(name))
+        if name.startswith("citygml"):
+            print(*validate_gml(path, f"{name[-1]}.0"), sep="\n", end="", flush=True)
+    shown = " / ".join(map(str, tiles))
+    return (
+        f"{shown} tiles: {same} of {len(cities)} cities equal, {len(list_formats())} exports, "
+        f"{len(TARGETS)} conversions, CityGML valid unless lines of xmllint stand above"
+    )
+
+
 def main() -> None:
     """Mesh the samples that are named, or all, with one parameter or another."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="words in the names of samples; none for all")
     parser.add_argument("--clearance", type=float, help="m; by default that of a run")
+    parser.add_argument("--all", action="store_true", help="three tilings, and all exports and conversions")
     given = parser.parse_args()
     for name, options in SAMPLES.items():
         if given.names and not any(word in name for word in given.names):
             continue
         with tempfile.TemporaryDirectory() as folder:
-            values = {"buildings": [str(DATA / name)], "out": folder, "overwrite": True} | options
+            values = {"buildings": [str(DATA / name)]} | options
             if given.clearance is not None:
                 values["clearance"] = given.clearance
-            record = run(make_config(values))
-            if not (proved := check_run(Path(folder), StoredTerrain)).ok:
-                print(*proved.lines(), sep="\n", flush=True)
-            print(describe(name, record, Path(folder)), flush=True)
+            record = prove(values, Path(folder) / "out")
+            print(describe(name, record, Path(folder) / "out"), flush=True)
+            if given.all:
+                print(try_all(values, record, Path(folder)), flush=True)
 
 
 if __name__ == "__main__":
