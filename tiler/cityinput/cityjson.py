@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import accumulate
@@ -20,6 +21,8 @@ DEPTH = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, 
 RELIEF = "TINRelief"
 STOREY = "BuildingStorey"
 AROUND = ("Road", "PlantCover", "SolitaryVegetationObject")  # around buildings
+
+_MEMBERS = {"attributes": dict, "parents": list, "geometry": list}  # of a city object, if it has them
 
 Object = Mapping[str, Any]
 Vertices = NDArray[np.float64]
@@ -119,6 +122,12 @@ def _objects_of(path: Path, document: dict[str, Any]) -> Object:
     objects = document.get("CityObjects")
     if not isinstance(objects, dict):
         raise InputError(f"{path}: has no CityObjects; give a CityJSON file with buildings")
+    for name, thing in objects.items():
+        if not isinstance(thing, dict):
+            raise InputError(f"{path}: the city object {name} is no JSON object; write it anew")
+        for key, kind in _MEMBERS.items():
+            if not isinstance(thing.get(key) or kind(), kind):
+                raise InputError(f"{path}: the {key} of {name} have the wrong type; write it anew")
     return objects
 
 
@@ -150,8 +159,7 @@ def read_buildings(
     parts: dict[str, list[str]] = {}
     for name, thing in objects.items():
         if thing.get("type") == "BuildingPart" or (around and thing.get("type") == STOREY):
-            known = [parent for parent in thing.get("parents", ()) if parent in objects]
-            parts.setdefault(known[0] if known else name, []).append(name)
+            parts.setdefault(_find_owner(name, objects), []).append(name)
     for name, thing in objects.items():
         if thing.get("type") == "Building" or (
             thing.get("type") == "BuildingPart" and name in parts.get(name, ())
@@ -163,6 +171,19 @@ def read_buildings(
             yield _read_building(name, objects, vertices, [], height)
 
 
+def _find_owner(name: str, objects: Object) -> str:
+    """Find what a part or storey belongs to: its first parent, of a part of a part the first that is none."""
+    owner, passed = name, {name}
+    while known := [one for one in objects[owner].get("parents") or () if one in objects]:
+        if known[0] in passed:  # parts of each other: by itself
+            return name
+        owner = known[0]
+        passed.add(owner)
+        if objects[owner].get("type") != "BuildingPart" or objects[name].get("type") == STOREY:
+            break
+    return owner
+
+
 def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[str], height: str) -> ModelBuilding:
     shapes: list[Shape] = []
     faults: list[str] = []
@@ -171,9 +192,8 @@ def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[s
             try:
                 shapes.append(_read_shape(owner, geometry, vertices))
             except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
-                faults.append(
-                    f"{owner}: a {geometry.get('type')} cannot be read ({type(error).__name__}: {error})"
-                )
+                kind = geometry.get("type") if isinstance(geometry, Mapping) else "geometry"
+                faults.append(f"{owner}: a {kind} cannot be read ({type(error).__name__}: {error})")
     attributes = {owner: objects[owner].get("attributes") or {} for owner in dict.fromkeys([name, *parts])}
     above = _number(attributes[name].get(height or "measuredHeight"))
     kinds = {owner: kind for owner in attributes if (kind := objects[owner]["type"]) in (STOREY, *AROUND)}
@@ -236,6 +256,16 @@ def _make_faces(faces: list[Any], values: Any, kinds: list[int], vertices: Verti
         raise IndexError(f"vertex {index.min()}")
     ring_start, face_start = (np.array([0, *accumulate(counts)], np.int64) for counts in (lengths, sizes))
     return Faces(check_places(vertices[index]), ring_start, face_start, np.array(sorts, np.int8))
+
+
+def count_others(objects: Object, *, around: bool = False) -> Counter[str]:
+    """Count the objects with geometry that `read_buildings` and `read_relief` leave out, by type."""
+    read = {"Building", "BuildingPart", RELIEF, *((STOREY, *AROUND) if around else ())}
+    return Counter(
+        str(thing.get("type"))
+        for thing in objects.values()
+        if thing.get("type") not in read and thing.get("geometry")
+    )
 
 
 def read_relief(objects: Object, vertices: Vertices) -> list[Faces]:

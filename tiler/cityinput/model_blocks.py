@@ -72,7 +72,7 @@ def read_model_blocks(path: Path, frame: Frame, bounds: Box, wanted: Wanted) -> 
     that of a thousand buildings.
     """
     batch: list[ModelBuilding] = []
-    given = False
+    given, others = False, Counter[str]()
     for each in scan_model(path, wanted.height):
         if isinstance(each, ModelBuilding):
             batch.append(each)
@@ -82,8 +82,12 @@ def read_model_blocks(path: Path, frame: Frame, bounds: Box, wanted: Wanted) -> 
         elif isinstance(each, Relief) and wanted.ground_points:
             yield from _make_relief(each.faces, frame, bounds, wanted.shift)
             given = True
-    if batch or not given:
-        yield _make_block(batch, frame, bounds, wanted)
+        elif isinstance(each, Counter):
+            others.update({f"model objects not read, {kind}": n for kind, n in each.items()})
+    if batch or others or not given:
+        block = _make_block(batch, frame, bounds, wanted)
+        block.counts.update(others)
+        yield block
 
 
 def _make_block(batch: Sequence[ModelBuilding], frame: Frame, bounds: Box, wanted: Wanted) -> ModelBlock:

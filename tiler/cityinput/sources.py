@@ -1,6 +1,7 @@
 """Files of city models: what kind they are, what they say of themselves, and their buildings one at a time."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pyproj
 
 from pipeline.data.errors import ConfigError, InputError
 from tiler.cityinput.citygml import Relief, scan_citygml
-from tiler.cityinput.cityjson import read_buildings, read_objects, read_relief
+from tiler.cityinput.cityjson import count_others, read_buildings, read_objects, read_relief
 from tiler.cityinput.crs_names import NamedCrs, read_crs_name
 from tiler.cityinput.face_planes import signed_volume, upward_area
 from tiler.cityinput.faces import ModelBuilding
@@ -45,8 +46,10 @@ def kind_of(path: Path) -> str:
 
 def scan_model(
     path: Path, height: str = "", *, attributes: bool = False, around: bool = False
-) -> Iterator[str | ModelBuilding | Relief]:
+) -> Iterator[str | ModelBuilding | Relief | Counter[str]]:
     """Give the names of CRSs, the buildings and the terrain of a city model, in the order of the file.
+
+    Also numbers of other objects of CityJSON, by type.
 
     Parameters
     ----------
@@ -82,6 +85,8 @@ def scan_model(
     for objects, vertices in documents:
         yield from read_buildings(objects, vertices, height, around=around)
         yield from map(Relief, read_relief(objects, vertices))
+        if others := count_others(objects, around=around):
+            yield others
 
 
 class _Survey:

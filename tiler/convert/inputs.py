@@ -60,6 +60,8 @@ class ModelSource:
                     self.told["what cannot be read"] += len(each.faults)
                     self.told["buildings without surfaces"] += not each.shapes
                     yield _place(each, frame)
+                elif isinstance(each, Counter):
+                    self.told.update({f"objects of type {kind}, left out": n for kind, n in each.items()})
                 elif not isinstance(each, str):
                     self.told["surfaces of terrain, left out"] += 1
 

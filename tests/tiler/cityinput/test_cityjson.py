@@ -46,12 +46,17 @@ def test_parts_belong_to_their_building(tmp_path: Path) -> None:
         "part": {"type": "BuildingPart", "parents": ["whole"], "geometry": [solid("2")]},
         "whole": {"type": "Building", "children": ["part"]},
         "orphan": {"type": "BuildingPart", "parents": ["elsewhere"], "geometry": [solid("1.2", semantics=False)]},
+        "inner": {"type": "BuildingPart", "parents": ["part"], "geometry": [solid("2")]},
+        "one": {"type": "BuildingPart", "parents": ["other"], "geometry": [solid("2")]},
+        "other": {"type": "BuildingPart", "parents": ["one"], "geometry": [solid("2")]},
         "road": {"type": "Road", "geometry": [solid("2")]},
     }
-    found = buildings_of(write_json(tmp_path / "a.json", city_json(objects, CORNERS)))
+    path = write_json(tmp_path / "a.json", city_json(objects, CORNERS))
+    found = buildings_of(path)
     assert [(one.id, [shape.owner for shape in one.shapes]) for one in found] == [
-        ("whole", ["part"]), ("orphan", ["orphan"]),
+        ("whole", ["part", "inner"]), ("orphan", ["orphan"]), ("one", ["one"]), ("other", ["other"]),
     ]  # fmt: skip
+    assert list(scan_model(path))[-1] == {"Road": 1}
     assert set(found[1].shapes[0].faces.kind.tolist()) == {UNKNOWN}
 
 
@@ -147,6 +152,11 @@ def test_a_vertex_without_a_place_costs_its_building_alone(tmp_path: Path, value
             "no CityObjects",
         ),
         (json.dumps(house_json())[:-40], "is no JSON object"),
+        (json.dumps(house_json() | {"CityObjects": {"a": None}}), "the city object a is no JSON object"),
+        (
+            json.dumps(house_json() | {"CityObjects": {"a": {"parents": 5}}}),
+            "the parents of a have the wrong type",
+        ),
         (json.dumps(house_json() | {"vertices": [[1, 2], [3, 4], [5, 6]]}), "not all vertices have three numbers"),
     ],
 )
