@@ -36,6 +36,7 @@ from tiler.engine.task_graph import (
     readers,
 )
 from tiler.engine.watcher import Watcher
+from tiler.store.remembered import remembered_results
 from tiler.store.store import Store
 
 
@@ -79,6 +80,8 @@ class Engine:
     changes : dict of (str, str) to (str, list of box)
         Results that differ from the store that this one was copied from: their digest there, and boxes of what
         differs.
+    known : dict or None
+        Records that this process keeps from one run to the next, see `tiler.store.remembered`.
     """
 
     def __init__(
@@ -98,6 +101,7 @@ class Engine:
         self.set_aside: dict[Item, SetAside] = {}
         self.blocked: dict[Item, Item] = {}
         self.changes: dict[Item, tuple[str, list[Box]]] = {}
+        self.known = remembered_results()
         self.policy = policy or Policy()
         self.stopped = False
         self._gaps = Gaps(layout.absent)

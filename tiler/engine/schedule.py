@@ -18,11 +18,15 @@ from tiler.engine.stage import Scope, Stage, boxes_touch
 from tiler.engine.submission import Item, Outcome, Part
 from tiler.engine.task import Failure, Later, Record, Task
 from tiler.engine.task_graph import Items, Refs, chain_seams, invert, own_refs, readers
+from tiler.objects.places import in_bucket
+from tiler.store.checksums import FILES, find_changed_files
+from tiler.store.remembered import file_state
 from tiler.words.stage_groups import place_of_item
 
 if TYPE_CHECKING:
     from tiler.engine.engine import Engine
 
+MOST_KNOWN = 2**16  # results that a process knows from one run to the next
 SMALL_ONES = 8  # small tasks of a stage that are submitted together, at most
 
 
@@ -148,7 +152,11 @@ class Schedule:
         left: dict[int, int] = {}  # how many others each task waits for
         for ticket in ready:
             refs, lacking = self._find_reads(ticket, {})
-            if lacking:
+            known = None if lacking else self._find_known(ticket, refs)
+            if known is not None:
+                self.begun[ticket] = True
+                self._keep(ticket, known)
+            elif lacking:
                 self.begun[ticket] = True
                 engine.blocked[self._item(ticket)] = lacking[0]
                 self._lose(ticket, f"not run: {' '.join(lacking[0])} is not there", lacking[0])
@@ -194,7 +202,32 @@ class Schedule:
         """
         engine, planned = self.engine, self.plan[self.rank[ticket]]
         scope, (stage, name) = planned.stage.scope, self._item(ticket)
-        path, identity, frame, share = file_identity(engine.layout, scope, name)
+        path, _, frame, share = file_identity(engine.layout, scope, name)
+        made = self._make_key(ticket, refs, before)
+        key = None if made.awaited() else made.close({}, engine.store)[0]
+        task = Task(
+            *(
+                stage,
+                name,
+                scope,
+                made.box,
+                planned.parameters,
+                engine.context,
+                path,
+                engine.store,
+                refs,
+                key or "",
+            ),
+            *(engine.store.path.parent, frame, share),
+            former="" if key is None else self._former_key(planned.stage, made),
+        )
+        return Part(planned.stage.function, task, made if key is None else None)
+
+    def _make_key(self, ticket: int, refs: dict[str, tuple[str, ...]], before: Collection[Item]) -> OpenKey:
+        """Collect what the key of a task is made of; parameters as of `_make_part`."""
+        engine, planned = self.engine, self.plan[self.rank[ticket]]
+        scope, (_, name) = planned.stage.scope, self._item(ticket)
+        _, identity, _, _ = file_identity(engine.layout, scope, name)
         xmin, ymin, xmax, ymax = planned.items.boxes[ticket - planned.first].tolist()
         box = (xmin, ymin, xmax, ymax)
 
@@ -209,14 +242,36 @@ class Schedule:
         held = {source: [n for n, found in names.items() if found] for source, names in digests.items()}
         gaps = engine.find_gaps(scope, box, held)
         named_by = {source: by for source, by in planned.named_by.items() if (by, name) in before}
-        made = OpenKey(planned.digest, name, box, identity, digests, gaps, named_by)
-        key = None if made.awaited() else made.close({}, engine.store)[0]
-        task = Task(
-            *(stage, name, scope, box, planned.parameters, engine.context, path, engine.store, refs, key or ""),
-            *(engine.store.path.parent, frame, share),
-            former="" if key is None else self._former_key(planned.stage, made),
+        return OpenKey(planned.digest, name, box, identity, digests, gaps, named_by)
+
+    def _find_known(self, ticket: int, refs: dict[str, tuple[str, ...]]) -> Record | None:
+        """Find the record of a result that this process knows from an earlier run; None if a byte may differ."""
+        engine, (stage, name) = self.engine, self._item(ticket)
+        known = engine.known and engine.known.get((stage, name))
+        if not known:
+            return None
+        record, made, state = known
+        same = (
+            vars(self._make_key(ticket, refs, {})) == made and file_state(engine.store.file(stage, name)) == state
         )
-        return Part(planned.stage.function, task, made if key is None else None)
+        if not same or find_changed_files(engine.store.path.parent, record.facts.get(FILES, {})):
+            return None
+        found: Record = record
+        return found
+
+    def _remember(self, ticket: int, record: Record) -> None:
+        """Keep a record for the next run of this process."""
+        engine, item = self.engine, self._item(ticket)
+        if engine.known is None or in_bucket(engine.store.path):
+            return
+        if item in engine.known or len(engine.known) < MOST_KNOWN:
+            refs, _ = self._find_reads(ticket, {})
+            made, state = vars(self._make_key(ticket, refs, {})), file_state(engine.store.file(*item))
+            engine.known[item] = (
+                replace(record, seconds={}, peak_memory=0, reused=True, damage="", ago=0.0),
+                made,
+                state,
+            )
 
     def _former_key(self, stage: Stage, key: OpenKey) -> str:
         """Key of the same result before changes that do not reach it; nothing where there is none."""
@@ -289,6 +344,7 @@ class Schedule:
                     if open_key and not self._is_key(ticket, outcome):
                         self._put_back(ticket)
                     else:
+                        self._remember(ticket, outcome)
                         self._keep(ticket, outcome)
                 case Failure():
                     self._fail(ticket, outcome)

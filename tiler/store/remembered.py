@@ -26,6 +26,7 @@ class _Known:
 
     found: dict[tuple[object, ...], tuple[tuple[int, int], bytes]] = field(default_factory=dict)
     n_bytes: int = 0
+    results: dict[tuple[str, str], Any] = field(default_factory=dict)
 
 
 _KNOWN: ContextVar[_Known | None] = ContextVar("known", default=None)
@@ -42,6 +43,21 @@ def remembering() -> Iterator[None]:
         yield
     finally:
         _KNOWN.reset(token)
+
+
+def remembered_results() -> dict[tuple[str, str], Any] | None:
+    """Give what this thread keeps of results from run to run, by stage and name; None where it keeps nothing."""
+    known = _KNOWN.get()
+    return None if known is None else known.results
+
+
+def file_state(path: Path) -> tuple[int, ...]:
+    """Give what changes when a file is written anew: device, inode, size and time; nothing where there is none."""
+    try:
+        stat = os.stat(path)
+    except OSError:
+        return ()
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
 
 
 def remember(

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from tiler.engine.watcher import Watcher
 from tiler.executors.local_cluster import local
 from tiler.executors.remote_cluster import connect
 from tiler.store.checksums import state_files
+from tiler.store.remembered import remembering
 from tiler.store.store import Store
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -328,17 +330,27 @@ def test_a_changed_file_reruns_its_readers_only(serial_run: Engine, tmp_path: Pa
     assert contents(partial.store.path) == contents(whole.store.path)
 
 
+@pytest.fixture(params=[nullcontext, remembering], ids=["forgets", "remembers"])
+def memory(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A process that knows nothing of earlier runs, and one that keeps their records."""
+    with request.param():
+        yield
+
+
+@pytest.mark.usefixtures("memory")
 def test_what_comes_out_the_same_makes_nothing_else_run(serial_run: Engine, tmp_path: Path) -> None:
     """Another file with the same points: it is read, its tiles do not run."""
     layout = grid_layout()
     files = dict(layout.files) | {"f2": replace(layout.files["f2"], identity="touched")}
     shutil.copytree(serial_run.store.path, tmp_path / "store.zarr")
+    assert rerun(run_all(make(tmp_path))) == set()
     again = run_all(make(tmp_path, layout=replace(layout, files=files)))
     assert rerun(again) == {("ingest", "f2")}
     assert again.records["ingest", "f2"].key != serial_run.records["ingest", "f2"].key
     assert again.records["ingest", "f2"].digest == serial_run.records["ingest", "f2"].digest
 
 
+@pytest.mark.usefixtures("memory")
 def test_files_beside_the_store_must_be_as_stated(tmp_path: Path) -> None:
     stages = [Stage("note", Scope.TILE, writes_file), Stage("count", Scope.REGION, seen, (Read("note"),))]
     engine = make(tmp_path, context=tmp_path)
@@ -393,9 +405,11 @@ def test_a_moved_file_is_the_same_file(serial_run: Engine, tmp_path: Path) -> No
     assert rerun(run_all(make(tmp_path, layout=replace(layout, files=files)))) == set()
 
 
+@pytest.mark.usefixtures("memory")
 def test_a_deleted_or_damaged_result_runs_again_alone(serial_run: Engine, tmp_path: Path) -> None:
     store = tmp_path / "store.zarr"
     shutil.copytree(serial_run.store.path, store)
+    assert rerun(run_all(make(tmp_path))) == set()
     (store / "seam" / "x1.1.zip").unlink()
     plane = store / "plane" / "0.0.zip"
     plane.write_bytes(plane.read_bytes()[:-30])
