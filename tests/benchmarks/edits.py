@@ -1,8 +1,8 @@
 """What an edit takes in the service: `python -m tests.benchmarks.edits OUT [N]`.
 
 In a copy of hard links beside OUT, N houses are moved, each of four twice. A line an edit has seconds of the clock
-and of the processor, for the mesh and for the 3D Tiles, and the load of the machine. As in the service, the garbage
-collector passes over what was there before.
+and of the processor, for the mesh and for the 3D Tiles, and the load of the machine. As in the service, the
+collector of garbage passes over what was there before.
 """
 
 import gc

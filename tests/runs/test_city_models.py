@@ -1,6 +1,7 @@
 """A block of gabled houses of a city model on rasters of terrain: meshed without any point."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import rasterio
 import shapely
 from rasterio.transform import Affine
 
+import tiler
 from pipeline.data.errors import ConfigError, InputError
 from tests.helpers.tiles import write_footprints
 from tests.runs.test_run import hashes
@@ -133,6 +135,30 @@ def test_tiles_change_no_roof(block: tuple[dict[str, Any], Path, dict[str, Any]]
     values, out, _ = block
     run(make_config(values | {"out": str(tmp_path), "tile_size": 400.0}))
     assert parts_of(tmp_path) == parts_of(out)
+
+
+def test_an_edit_of_a_city_of_models_ends_in_the_mesh_of_the_final_model(
+    block: tuple[dict[str, Any], Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    values, out, _ = block
+    city = shutil.copytree(out, tmp_path / "city")
+    objects = [house(i, j) for i in range(SIDE) for j in range(SIDE) if (i, j) != (2, 1)]
+    corners = [[x + 1.5, y - 1, z + 3] for x, y, z in corners_of(1, 1)]
+    new = city_json({"h11": {"type": "Building", "geometry": [solid()]}}, corners)
+    tiler.open(city).remove("h21").replace("h11", write_json(tmp_path / "new.city.json", new))
+    assert parts_of(city)["h11-part1"]["roof_method"] == "model"
+    assert check_run(city, StoredTerrain).ok
+    objects[SIDE + 1] = new
+    final = str(write_sequence(tmp_path / "final.city.jsonl", objects))
+    run(make_config(values | {"buildings": [final], "out": str(tmp_path / "whole")}))
+    made, whole = (hashes(tmp_path / name) for name in ("city", "whole"))
+    assert {name: made[name] for name in whole if name.startswith(("mesh", "boundary"))} == {
+        name: digest for name, digest in whole.items() if name.startswith(("mesh", "boundary"))
+    }
+    square = shapely.box(PLACE[0], PLACE[1], PLACE[0] + 8, PLACE[1] + 6)
+    write_footprints(tmp_path / "flat.gpkg", np.array([square]), np.array(["h00"], np.object_), crs="EPSG:28992")
+    with pytest.raises(InputError, match="h00 has no height"):
+        tiler.open(city).replace("h00", tmp_path / "flat.gpkg")
 
 
 def test_other_formats_give_the_same_bytes(
@@ -307,6 +333,8 @@ def test_footprints_beside_a_model_give_way_to_its_buildings(tmp_path: Path) -> 
         assert methods == {"h00": "model", "h10": "model", cut["subject"]: "flat", "new": "planes"}
         assert cut["subject"].startswith("h10-g")
         assert check_run(out, StoredTerrain).ok
+        with pytest.raises(ConfigError, match="--footprints beside --buildings, which cannot be edited yet"):
+            tiler.open(out).remove("new")
         cities.append(parts)
     assert cities[0] == cities[1]
 

@@ -309,9 +309,10 @@ def _read_run(directory: Path, workers: int, out: Path | None = None) -> tuple[d
             }
         )
     )
-    for name, why in (("buildings", "houses of a city model"), ("align", "footprints that are moved")):
-        if getattr(config, name):
-            raise ConfigError(f"{directory}: was run with --{name}: {why} cannot be edited yet; run again instead")
-    if not config.footprints:
-        raise ConfigError(f"{directory}: was run without footprints; run again with them")
+    both = config.buildings and config.footprints
+    if both or config.align:
+        why = "--footprints beside --buildings" if both else "--align: footprints that are moved"
+        raise ConfigError(f"{directory}: was run with {why}, which cannot be edited yet; run again instead")
+    if not config.footprints and not config.buildings:
+        raise ConfigError(f"{directory}: was run without buildings; run again with footprints or a city model")
     return record, config

@@ -84,6 +84,14 @@ def read_upload(upload: Upload, config: Config, *, crs: str, bounds: Box) -> Upl
     InputError
         If the file cannot be read, or a feature is no valid polygon or lies outside the region.
     """
+    found = _read(upload, config, crs, bounds)
+    without = found.footprints.ids[np.isnan(found.footprints.given_height)].tolist()
+    if config.buildings and without:  # the points are those of the model's own roofs
+        raise InputError(f"{upload.path}: {without[0]} has no height; give it one, in the attribute {HEIGHT}")
+    return found
+
+
+def _read(upload: Upload, config: Config, crs: str, bounds: Box) -> Uploaded:
     path, position = upload.path, upload.position
     if is_missing(path):
         raise InputError(f"{path}: no such file; check the path of the upload")

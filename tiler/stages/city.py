@@ -278,7 +278,7 @@ def _find_surfaces(task: Task, city: City, uploads: ModelRows) -> tuple[RoofSurf
     of_models = task.parameters.get("buildings_given", False)
     with task.step("1.2 roof surfaces") if of_models or len(uploads) else nullcontext():
         if of_models:
-            surfaces, base = read_surfaces(task, city.model.polygons, city.model.ids)
+            surfaces, base = read_surfaces(task, city.model.polygons, city.model.ids, uploads)
         elif len(uploads):
             rows = find_rows(uploads, city.model.polygons, city.model.ids)
             surfaces, base = take_surfaces(uploads, rows)

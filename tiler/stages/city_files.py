@@ -20,7 +20,7 @@ from tiler.cityinput.lattices import Cells, interpolate_cells
 from tiler.cityinput.model_blocks import UNIT, Wanted, pack_points, read_model_blocks
 from tiler.cityinput.rasters import HEIGHT_UNIT, Lattice, find_lattice, read_raster
 from tiler.cityinput.row_arrays import OF_CELL, RowPacker, unpack_rows
-from tiler.cityinput.rows import ModelRows, join_rows, no_rows
+from tiler.cityinput.rows import ModelRows, join_rows, no_rows, take_rows
 from tiler.cityinput.sources import MODEL, TERRAIN
 from tiler.engine.stage import Box, Facts
 from tiler.engine.task import Task
@@ -161,16 +161,19 @@ def _find_doubles(task: Task, files: list[tuple[str, Facts]]) -> dict[str, str]:
 
 
 def read_surfaces(
-    task: Task, polygons: NDArray[np.object_], ids: NDArray[np.str_]
+    task: Task, polygons: NDArray[np.object_], ids: NDArray[np.str_], uploads: ModelRows
 ) -> tuple[RoofSurfaces, NDArray[np.float64]]:
     """Read the roof surfaces of houses from the city models near them, by their ids; and how low they reach (m).
 
-    A house that is a part of a building, as ``A-2`` of ``A``, takes those of the building.
+    A house that is a part of a building, as ``A-2`` of ``A``, takes those of the building. Uploaded buildings take
+    the place of those of their ids.
     """
     extent = extent_of(polygons)
     if extent is None:
         return no_surfaces(0), np.empty(0)
     rows = join_rows([_rows_near(task, name, facts, extent) for name, facts in list_kind(task, MODEL)])
+    if len(uploads):
+        rows = join_rows([take_rows(rows, np.flatnonzero(~np.isin(rows.ids, uploads.ids))), uploads])
     return take_surfaces(rows, find_rows(rows, polygons, ids))
 
 
