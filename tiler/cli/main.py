@@ -473,9 +473,11 @@ def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[P
 
 
 def _render(options: argparse.Namespace) -> int:
+    from tiler.executors.dask_settings import FREED, keep_memory
     from tiler.pictures.render import render_run
 
     refuse_strangers(options.directory)
+    keep_memory(FREED)  # what is read for a picture is not needed while it is drawn
     render_run(options.directory, options.output, what=options.what, say=say)
     say(str(options.output))
     return 0

@@ -357,8 +357,8 @@ def load_air(
         if not north.any():
             continue
         city = rim.vertex[rim.boundary.facets[np.isin(rim.boundary.marker, SHOWN)]]
-        faces = find_outer_faces(piece.mesh.points, piece.mesh.cells[north], city)
-        used, rows = _number(faces, len(piece.mesh.points))
+        faces = find_outer_faces(piece.mesh.points, piece.mesh.cells, north, city)
+        used, rows = number_used(faces, len(piece.mesh.points))
         points.append(piece.mesh.points[used] - origin)
         corners.append(rows + n_points)
         n_points += len(used)
@@ -366,7 +366,9 @@ def load_air(
         return load_air(directory, origin, only=only)
     if not n_points:
         raise InputError(f"{directory / VOLUME_INDEX}: has no cell north of y = {origin[1]:.1f} m; run again")
-    return pyvista.PolyData.from_regular_faces(np.concatenate(points), np.concatenate(corners))
+    return pyvista.PolyData.from_regular_faces(
+        np.concatenate(points).astype(np.float32), np.concatenate(corners).astype(np.int32)
+    )
 
 
 def _average(values: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -378,9 +380,9 @@ def _average(values: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[n
 
 
 def find_outer_faces(
-    points: NDArray[np.float64], cells: NDArray[np.int32], hidden: NDArray[np.int64]
+    points: NDArray[np.float64], cells: NDArray[np.int32], chosen: NDArray[np.bool_], hidden: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Find the faces of cells that no two of them have.
+    """Find the faces of some cells that no two of them have.
 
     Parameters
     ----------
@@ -388,6 +390,8 @@ def find_outer_faces(
         Vertices.
     cells : int32, (m, 4)
         Rows of `points`.
+    chosen : bool, (m,)
+        Which cells.
     hidden : int64, (h, 3)
         Faces that are left out.
 
@@ -402,7 +406,9 @@ def find_outer_faces(
     """
     import pyvista
 
-    strips = np.array_split(np.argsort(points[cells[:, 0], 0]), max(1, len(cells) // STRIP_CELLS))
+    rows = np.flatnonzero(chosen).astype(np.int32)
+    rows = rows[np.argsort(points[cells[rows, 0], 0])]
+    strips = np.array_split(rows, max(1, len(rows) // STRIP_CELLS))
     found = []
     for strip in strips:
         surface = pyvista.UnstructuredGrid({TETRA: cells[strip]}, points).extract_surface(
@@ -433,6 +439,13 @@ def sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray
     return points[order[new]], index[facets]
 
 
+def number_used(rows: NDArray[Any], n_points: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Points that rows (k, 3) use, in their order, and the rows in numbers of these."""
+    used = np.zeros(n_points, np.bool_)
+    used[rows] = True
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[rows]
+
+
 def read_key(name: str) -> Key:
     """Take the tile of a piece from its name; InputError if it is not named after one."""
     try:
@@ -460,7 +473,7 @@ def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
     """Take ground, walls and roofs, with the quality of the cells of a volume piece behind them."""
     boundary = piece.boundary
     shown = np.isin(boundary.marker, SHOWN)
-    used, corners = _number(boundary.facets[shown], len(piece.points))
+    used, corners = number_used(boundary.facets[shown], len(piece.points))
     ratio = np.full(len(shown), np.nan, np.float32)
     if volume is not None:
         ratio = measure_facets(read_vtu(volume).mesh, piece)
@@ -472,10 +485,3 @@ def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
         boundary.building[shown],
         ratio[shown],
     )
-
-
-def _number(rows: NDArray[Any], n_points: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Points that rows (k, 3) use, in their order, and the rows in numbers of these."""
-    used = np.zeros(n_points, np.bool_)
-    used[rows] = True
-    return np.flatnonzero(used), (np.cumsum(used) - 1)[rows]

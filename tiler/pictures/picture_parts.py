@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker
-from tiler.pictures.picture_data import City, read_key
+from tiler.pictures.picture_data import City, number_used, read_key
 
 # Edges are drawn while a triangle has this many pixels in the mean, strongest from four times as many.
 EDGE_PIXELS = 8.0
@@ -127,8 +127,6 @@ def add_city(
     edges : bool
         Whether edges of triangles are drawn where they are long enough.
     """
-    import pyvista
-
     lines = _edge_style(len(city.facets), size) if edges else {}
     if colours == "quality":
         shown: Any = city.quality
@@ -142,9 +140,8 @@ def add_city(
     built = city.marker != Marker.GROUND
     for part, smooth in ((~built, True), (built, False)):
         if part.any():
-            surface = pyvista.PolyData.from_regular_faces(city.points, city.facets[part])
+            surface = _make_surface(city.points, city.facets[part])
             surface.cell_data["shown"] = shown[part]
-            surface = surface.clean()
             actor = plotter.add_mesh(surface, scalars="shown", smooth_shading=smooth, **painted, **MATT, **lines)
             if actor is not None:  # None without OpenGL, where no lines are drawn
                 actor.mapper.resolve = "polygon_offset"  # outlines are in front of what they are on
@@ -242,6 +239,14 @@ def make_skirt(city: City) -> Any:
     n = len(city.points)
     quads = np.column_stack([b, a, a + n, b + n])
     return pyvista.PolyData.from_regular_faces(np.vstack([city.points, foot]), quads).clean()
+
+
+def _make_surface(points: NDArray[np.float64], facets: NDArray[np.int64]) -> Any:
+    """Make a surface of the points that facets use, in single precision, as VTK draws it."""
+    import pyvista
+
+    used, rows = number_used(facets, len(points))
+    return pyvista.PolyData.from_regular_faces(points[used].astype(np.float32), rows.astype(np.int32))
 
 
 def _edge_style(n_facets: int, size: tuple[int, int]) -> dict[str, Any]:

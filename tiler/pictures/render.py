@@ -44,7 +44,7 @@ OCCLUSION_RADIUS = 20.0
 MOST_SHADED = 10_000.0  # m; in a larger region a house is below a pixel, and the shade is of the terrain's slope
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
-AT_ONCE = 600_000  # pixels of a picture that are drawn at a time, or as many as darken each other
+AT_ONCE = 400  # pixels along each side of what is drawn at a time, or as many as darken each other
 BLURRED = 4  # rows of the shade that VTK makes one
 SHADE = 16  # places around each pixel drawn that may darken it
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
@@ -145,7 +145,7 @@ def render_run(
     -----
     The camera follows from the region alone, but VTK samples the shade between buildings at random: two pictures
     of one run differ in some pixels.
-    Memory is bounded: 260 MiB for libraries, and some 100 bytes for each pixel drawn at a time. Facets beyond
+    Memory is bounded: 300 MiB for libraries, and some 100 bytes for each pixel drawn at a time. Facets beyond
     `picture_data.MOST_FACETS` are made coarser, and what is shown cell by cell, ``"mesh"``, ``"overview"`` and
     ``"sizes"``, is the middle of a larger region (`find_middle`).
     Edges fade out as triangles get small on the picture. Everything is moved to the origin first,
@@ -224,9 +224,7 @@ def draw_city(
     # The legend of quality gives the colours as they are.
     dark = max(OCCLUSION_RADIUS, extent / 100) if extent < MOST_SHADED and colours != "quality" else 0.0
     beside = SAMPLES * math.ceil(dark / extent * zoom * size[0]) + 2 * BLURRED if dark else 0
-    rows = max(SAMPLES * (AT_ONCE // SAMPLES**2 // size[0]), 4 * beside)
-    whole = colours == "quality" or rows > size[1] * SAMPLES / 2
-    with _plotter(size, rows=None if whole else rows) as plotter:
+    with _plotter(size, most=0 if colours == "quality" else max(AT_ONCE, 4 * beside)) as plotter:
         full = round(size[0] * zoom), round(size[1] * zoom)  # pixels that all of it would have
         shown = add_city(plotter, city, full, colours=colours, edges=edges)
         if air is not None:
@@ -239,11 +237,12 @@ def draw_city(
         _light(plotter)
         plotter.camera.view_angle = VIEW_ANGLE
         plotter.camera.position, plotter.camera.focal_point = _aim(shown, size, cut=air is not None)
+        del shown
         plotter.camera.up = (0.0, 0.0, 1.0)
         plotter.reset_camera_clipping_range()
         if dark:
             plotter.enable_ssao(radius=dark, bias=extent / 1500, kernel_size=SHADE)
-        return _shoot_strips(plotter, size[1], beside)
+        return _shoot_blocks(plotter, size, beside)
 
 
 def _draw_plainly(city: City, size: tuple[int, int], *, colours: str, edges: bool, air: Any) -> Image:
@@ -317,13 +316,13 @@ def _draw(directory: Path, what: str, size: tuple[int, int], say: Callable[[str]
 
 
 @contextmanager
-def _plotter(size: tuple[int, int], *, rows: int | None = None) -> Iterator[Any]:
-    """Open a plotter that draws a picture of a size (pixels), at most so many rows of pixels drawn at a time."""
+def _plotter(size: tuple[int, int], *, most: int = 0) -> Iterator[Any]:
+    """Open a plotter that draws a picture of a size (pixels), in blocks of at most so many drawn a side."""
     import pyvista
 
     # VTK says aloud that there is no display before it takes the way without one.
     with pyvista.vtk_verbosity("off"):
-        window = [SAMPLES * size[0], min(SAMPLES * size[1], rows or SAMPLES * size[1])]
+        window = [min(SAMPLES * n, most or SAMPLES * n) for n in size]
         plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
         plotter.disable_anti_aliasing()  # `SAMPLES` is that; VTK would draw each of its pixels several times
         try:
@@ -338,26 +337,53 @@ def _shoot(plotter: Any) -> Image:
     return np.asarray(Pictures.fromarray(plotter.screenshot(return_img=True)).reduce(SAMPLES))
 
 
-def _shoot_strips(plotter: Any, n_rows: int, beside: int) -> Image:
-    """Draw a picture of so many rows in strips: VTK takes some 100 bytes for each pixel that it draws at a time.
+def _shoot_blocks(plotter: Any, size: tuple[int, int], beside: int) -> Image:
+    """Draw a picture in blocks: VTK takes some 100 bytes for each pixel that it draws at a time.
 
-    `beside`: pixels drawn above and below each strip, which darken it. VTK blurs the shade, and takes what is at
-    the other end of what it draws for what is beyond an end: so `BLURRED` rows are drawn beyond the picture.
+    `beside`: pixels drawn around each block, which darken it. VTK blurs the shade, and takes what is at the other
+    end of what it draws for what is beyond an end: so `BLURRED` rows are drawn beyond the picture.
     """
-    whole, drawn, camera = SAMPLES * n_rows, plotter.window_size[1], plotter.camera
+    camera, (width, height) = plotter.camera, plotter.window_size
+    camera.view_angle = np.degrees(
+        2 * np.arctan(np.tan(np.radians(camera.view_angle) / 2) * height / (SAMPLES * size[1]))
+    )
+    strips = []
+    for skipped, foot, top, middle in _cut(SAMPLES * size[1], height, beside):
+        below, above = blend(np.array([1 - top, 1 - foot]), SKY)
+        plotter.set_background(below, top=above)
+        blocks = []
+        for left, _, _, centre in _cut(SAMPLES * size[0], width, beside):
+            camera.SetWindowCenter(centre, -middle)
+            plotter.render()
+            blocks.append(_shoot(plotter)[skipped, left])
+        strips.append(np.hstack(blocks))
+    return np.vstack(strips)
+
+
+def _cut(whole: int, drawn: int, beside: int) -> Iterator[tuple[slice, float, float, float]]:
+    """Cut a side of a picture into blocks of pixels drawn.
+
+    Yields
+    ------
+    slice
+        Which pixels shown are of the block, of those that are drawn for it.
+    first, last : float
+        Where what is drawn begins and ends, in shares of the side.
+    middle : float
+        How far its middle is from that of the side, in halves of what is drawn.
+    """
     beyond = min(beside, BLURRED) if drawn < whole else 0
     own = drawn - 2 * beside if drawn < whole else whole
-    camera.view_angle = np.degrees(2 * np.arctan(np.tan(np.radians(camera.view_angle) / 2) * drawn / whole))
-    strips = []
     for begin in range(0, whole, own):
         first = min(max(begin - beside, -beyond), whole - drawn + beyond)
-        foot, top = 1 - (first + drawn) / whole, 1 - first / whole  # shares of the height of the picture
-        camera.SetWindowCenter(0.0, (foot + top - 1) * whole / drawn)
-        below, above = blend(np.array([foot, top]), SKY)
-        plotter.set_background(below, top=above)
-        plotter.render()
-        strips.append(_shoot(plotter)[(begin - first) // SAMPLES :][: own // SAMPLES])
-    return np.vstack(strips)[:n_rows]
+        skipped = (begin - first) // SAMPLES
+        n = min(own, whole - begin) // SAMPLES
+        yield (
+            slice(skipped, skipped + n),
+            first / whole,
+            (first + drawn) / whole,
+            (2 * first + drawn - whole) / drawn,
+        )
 
 
 def _light(plotter: Any) -> None:

@@ -138,13 +138,13 @@ def test_the_overview_has_both_halves(run: Path, tmp_path: Path) -> None:
     assert blue(left).mean() < 0.002
 
 
-def test_a_picture_in_strips_is_the_one_drawn_at_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_in_blocks_is_the_one_drawn_at_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     city = load_city(run)
     city = replace(city, points=10 * city.points)
     whole = draw_city(city, SIZE).astype(np.int64)
     monkeypatch.setattr(render, "AT_ONCE", 1)
-    strips = draw_city(city, SIZE).astype(np.int64)
-    difference = np.abs(strips - whole).max(axis=2)
+    blocks = draw_city(city, SIZE).astype(np.int64)
+    difference = np.abs(blocks - whole).max(axis=2)
     assert difference.mean() < 3, "the shade has a pattern of 4 pixels"
     assert difference.mean(axis=1).max() < 6
 
@@ -277,12 +277,13 @@ def test_the_cut_keeps_whole_cells_of_the_northern_half(run: Path) -> None:
 def test_outer_faces_enclose_the_cells(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(picture_data, "STRIP_CELLS", 500)
     mesh = read_vtu(run / "mesh" / f"{PIECES[0]}.vtu").mesh
-    faces = find_outer_faces(mesh.points, mesh.cells, np.empty((0, 3), np.int64))
+    whole = np.ones(len(mesh.cells), np.bool_)
+    faces = find_outer_faces(mesh.points, mesh.cells, whole, np.empty((0, 3), np.int64))
     a, b, c, d = np.moveaxis(mesh.points[mesh.cells] - mesh.points[0], 1, 0)
     volume = np.abs(((b - a) * np.cross(c - a, d - a)).sum(axis=1)).sum() / 6
     a, b, c = np.moveaxis(mesh.points[faces] - mesh.points[0], 1, 0)
     assert (a * np.cross(b, c)).sum() / 6 == pytest.approx(volume)
-    assert np.array_equal(find_outer_faces(mesh.points, mesh.cells, faces[:9]), faces[9:])
+    assert np.array_equal(find_outer_faces(mesh.points, mesh.cells, whole, faces[:9]), faces[9:])
 
 
 def test_heights_above_ground_are_those_of_the_building() -> None:
