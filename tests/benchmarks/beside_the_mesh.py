@@ -74,7 +74,14 @@ def list_commands(folder: Path) -> dict[str, tuple[str, ...]]:
         f"`render --what {what}`": ("render", out, "--what", what, "-o", str(folder / f"{what}.png"))
         for what in ("boundary", "mesh", "overview", "tiles")
     }
-    case = ("export", out, "--format", "openfoam", "-o", str(folder / "case"), "--overwrite")
+    exports = {
+        f"`export --format {kind}{more}`": (
+            *("export", out, "--format", kind, "-o", str(folder / f"case.{kind}"), "--overwrite"),
+            *more.split(),
+        )
+        for kind in ("openfoam", "vtu")
+        for more in ("", " --workers 2")
+    }
     size = ("--size", "2500", "--buildings", "3000")
     return {
         "`run --workers 2`": (*run, "--overwrite"),
@@ -83,7 +90,7 @@ def list_commands(folder: Path) -> dict[str, tuple[str, ...]]:
         "`check --workers 2`": ("check", out, "--workers", "2"),
         "`check`": ("check", out),
         **pictures,
-        "`export --format openfoam`": case,
+        **exports,
         "`report`": ("report", out),
         "`synth --size 2500 --buildings 3000`": ("synth", str(folder / "again"), *size),
         "the same with `--workers 2`": ("synth", str(folder / "more"), *size, "--workers", "2"),
@@ -131,7 +138,7 @@ def main(words: list[str]) -> None:
         rows: dict[str, list[Measured]] = {title: [] for title in commands}
         for _ in range(int(words[0]) if words else 3):
             for title, command in commands.items():
-                for old in ("again", "more", "case"):
+                for old in ("again", "more", "case.openfoam"):
                     shutil.rmtree(folder / old, ignore_errors=True)
                 rows[title].append(measure(*command))
                 print(

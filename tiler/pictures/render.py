@@ -194,6 +194,7 @@ def draw_city(
     edges: bool = True,
     air: Any = None,
     close: bool = False,
+    at_once: int = AT_ONCE,
 ) -> Image:
     """Draw ground, walls and roofs from the south-west, and the air behind a cut.
 
@@ -209,6 +210,8 @@ def draw_city(
         From `load_air`.
     close : bool
         Show no more than `CLOSE` of the cut, in its middle.
+    at_once : int
+        Pixels along each side of what is drawn at a time: more take less time, and 100 bytes each.
 
     Returns
     -------
@@ -224,7 +227,7 @@ def draw_city(
     # The legend of quality gives the colours as they are.
     dark = max(OCCLUSION_RADIUS, extent / 100) if extent < MOST_SHADED and colours != "quality" else 0.0
     beside = SAMPLES * math.ceil(dark / extent * zoom * size[0]) + 2 * BLURRED if dark else 0
-    with _plotter(size, most=0 if colours == "quality" else max(AT_ONCE, 4 * beside)) as plotter:
+    with _plotter(size, most=0 if colours == "quality" else max(at_once, 4 * beside)) as plotter:
         full = round(size[0] * zoom), round(size[1] * zoom)  # pixels that all of it would have
         shown = add_city(plotter, city, full, colours=colours, edges=edges)
         if air is not None:
@@ -237,7 +240,7 @@ def draw_city(
         _light(plotter)
         plotter.camera.view_angle = VIEW_ANGLE
         plotter.camera.position, plotter.camera.focal_point = _aim(shown, size, cut=air is not None)
-        del shown
+        del shown, air
         plotter.camera.up = (0.0, 0.0, 1.0)
         plotter.reset_camera_clipping_range()
         if dark:
@@ -309,9 +312,10 @@ def _draw(directory: Path, what: str, size: tuple[int, int], say: Callable[[str]
         city = replace(city, level=load_levels(directory, city))
     if what not in CELL_BY_CELL:
         return draw_city(city, size, colours=COLOURS.get(what, "height"))
-    air = load_air(directory, city.origin, only=frozenset(city.names))
     left = size[0] // 2 if what == "overview" else 0
-    cut = draw_city(city, (size[0] - left, size[1]), air=air)
+    cut = draw_city(
+        city, (size[0] - left, size[1]), air=load_air(directory, city.origin, only=frozenset(city.names))
+    )
     return np.hstack([draw_city(city, (left, size[1])), cut]) if left else cut
 
 

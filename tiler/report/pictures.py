@@ -15,6 +15,7 @@ from tiler.report.page import figure, paragraph, text
 
 SIZE = (1120, 700)
 QUALITY = 84  # of JPEG
+AT_ONCE = 1200  # pixels along each side of what is drawn at a time: the report takes more memory before
 
 
 def describe_pictures(directory: Path) -> Iterator[str]:
@@ -43,12 +44,12 @@ def describe_pictures(directory: Path) -> Iterator[str]:
     )
     where = "" if middle is None else " in the middle of the region"
     yield _embed(
-        draw_city(city, SIZE),
+        draw_city(city, SIZE, at_once=AT_ONCE),
         f"The boundary from the south-west: ground by height, roofs by height above ground.{coarse}",
     )
     air = load_air(directory, part.origin, only=frozenset(part.names), within=2 * CLOSE)
     yield _embed(
-        draw_city(part, SIZE, air=air, close=True),
+        draw_city(part, SIZE, air=air, close=True, at_once=AT_ONCE),
         "The mesh in the middle of the region, cut open from west to east.",
     )
     yield _embed(

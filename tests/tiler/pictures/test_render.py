@@ -138,12 +138,11 @@ def test_the_overview_has_both_halves(run: Path, tmp_path: Path) -> None:
     assert blue(left).mean() < 0.002
 
 
-def test_a_picture_in_blocks_is_the_one_drawn_at_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_in_blocks_is_the_one_drawn_at_once(run: Path) -> None:
     city = load_city(run)
     city = replace(city, points=10 * city.points)
-    whole = draw_city(city, SIZE).astype(np.int64)
-    monkeypatch.setattr(render, "AT_ONCE", 1)
-    blocks = draw_city(city, SIZE).astype(np.int64)
+    whole = draw_city(city, SIZE, at_once=9999).astype(np.int64)
+    blocks = draw_city(city, SIZE, at_once=1).astype(np.int64)
     difference = np.abs(blocks - whole).max(axis=2)
     assert difference.mean() < 3, "the shade has a pattern of 4 pixels"
     assert difference.mean(axis=1).max() < 6
