@@ -75,13 +75,9 @@ def split_levels(polygons: NDArray[np.object_], points: RoofPoints, options: Lev
     parts may be L-shaped, in three pieces or around a courtyard without a rule of their own. The house is
     left whole if all this explains less than `min_explained`.
 
-    One cut alone misses most of what is there in large buildings. Roofs of Amsterdam with the median height
-    have an error (RMSE) of 4.5 m undivided, 4.0 m after one cut, 3.5, 3.2 and 3.0 m after 2, 4 and 8 in depth;
-    squares of 4 m with a height each would have 2.8 m, squares of 1 m 2.0 m.
-
     A new wall ends on an outer wall within 1 nm of it, at a vertex that only the parts have: the house next
     door does not, until the walls of both are noded. Houses do not see each other; points count once for
-    each house that contains them. 1.4 ms a house of Amsterdam.
+    each house that contains them.
     """
     _check(polygons, points, options)
     found = _divide(polygons, points, options)
