@@ -37,6 +37,8 @@ def test_cjio_reads_all_houses_and_takes_one_level_of_them(town: Path) -> None:
     objects = json.loads((town / "roofs.city.json").read_text())["CityObjects"].values()
     levels = {geometry["lod"] for thing in objects for geometry in thing["geometry"]}
     assert levels == {"2.2"}
+    run_program((cjio[0], "roofs.city.json", "export", "stl", "roofs.stl"), town)
+    assert (town / "roofs.stl").read_text().count("facet normal") > 10 * count_houses(town)
 
 
 @pytest.mark.long
