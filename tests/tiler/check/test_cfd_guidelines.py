@@ -1,6 +1,7 @@
 """`citystitch check --cfd`: distances, blockage and cells worked out by hand, and the table of a run."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,11 @@ def test_a_domain_that_is_right_for_one_guideline_alone(monkeypatch: pytest.Monk
 
 
 def test_what_fails_names_the_option(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = table(monkeypatch, survey(60.0, top=60.0), 240.0, 90.0)
+    found = replace(survey(60.0, top=60.0), cells_a_side=np.array([5.0, 6.3, 12.0]))
+    rows = table(monkeypatch, found, 240.0, 90.0)
+    assert rows["cells a building side"][1] == "6.3 median, 33% have them"
+    option = "a --wall-size of 0.46 times the present one, or a --mesh-size of 0.63 times"
+    assert rows["cells a building side"][4] == option
     assert rows["240 deg: inlet (west, south)"][4] == "--pad 15H 15H 5H 15H"
     assert rows["top above the highest roof"][1:] == (
         "2.0 H", ">= 5 H FAIL", ">= 5 H FAIL", "--domain-height 6H --top flat",
