@@ -31,6 +31,7 @@ FOOT_ROOM = 0.25  # m from an outline to the points of the ground around it
 AROUND = 100.0  # m; buildings that close count as neighbours ...
 FEWEST = 3  # ... and so many of them tell where the ground is, ...
 OFF = 15.0  # m, ... from which a foot is told that lies higher or lower than theirs in the median
+LONGEST = 5000.0  # m; a building or roof that is longer has wrong coordinates: points on it would fill the memory
 UNIT = 0.001  # m of a coordinate
 
 Array = NDArray[np.float64]
@@ -93,9 +94,15 @@ def read_model_blocks(path: Path, frame: Frame, bounds: Box, wanted: Wanted) -> 
 def _make_block(batch: Sequence[ModelBuilding], frame: Frame, bounds: Box, wanted: Wanted) -> ModelBlock:
     counts: Counter[str] = Counter()
     rows, notes = make_rows(batch, frame, wanted.lod, counts, wanted.shift)
+    length, of_surface = _lengths(rows.outlines), _lengths(rows.surfaces)
+    np.maximum.at(length, np.repeat(np.arange(len(rows)), np.diff(rows.start)), of_surface)
+    notes += [
+        Note("model-fault", str(rows.ids[k]), detail=f"it is {length[k] / 1000:,.0f} km long; left out")
+        for k in np.flatnonzero(length > LONGEST).tolist()
+    ]
     near = shapely.intersects(rows.outlines, shapely.box(*bounds)) if len(rows) else np.zeros(0, np.bool_)
     counts["model buildings outside the region"] += int((~near).sum())
-    rows = take_rows(rows, np.flatnonzero(near))
+    rows = take_rows(rows, np.flatnonzero(near & (length <= LONGEST)))
     box = shapely.bounds(rows.outlines).reshape(-1, 4)
     by_id = np.argsort(rows.ids, kind="stable")
     order = by_id[order_by_cell((box[by_id, :2] + box[by_id, 2:]) / 2, ROW_CELL).order]
@@ -113,6 +120,12 @@ def _make_block(batch: Sequence[ModelBuilding], frame: Frame, bounds: Box, wante
     inside = _within(xyz, bounds)
     kept = [note for note in notes if np.isnan(note.x) or _within(np.array([[note.x, note.y]]), bounds)[0]]
     return ModelBlock(rows, xyz[inside], found[inside], tuple(kept), counts)
+
+
+def _lengths(polygons: NDArray[np.object_]) -> Array:
+    box = shapely.bounds(polygons).reshape(-1, 4)
+    longest: Array = (box[:, 2:] - box[:, :2]).max(axis=1)
+    return longest
 
 
 def _within(xy: Array, bounds: Box) -> NDArray[np.bool_]:

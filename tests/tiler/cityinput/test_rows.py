@@ -289,6 +289,10 @@ def test_a_building_that_floats_or_is_sunk_is_told_where_feet_alone_tell_the_gro
         ("model-off-neighbours", "h4", "its foot is 30.0 m below those of the buildings around"),
     ]
     assert not block_of(path, Wanted("auto", "", roof_points=True, ground_points=False)).notes
+    vertices[4][0] += 6000.0  # of the roof of h0
+    block = block_of(write_json(tmp_path / "b.json", city_json(houses, vertices)))
+    assert ("h0", "it is 6 km long; left out") in [(note.subject, note.detail) for note in block.notes]
+    assert block.rows.ids.tolist() == ["h1", "h2", "h3", "h4"]
 
 
 def test_points_are_made_where_they_are_wanted(tmp_path: Path) -> None:
