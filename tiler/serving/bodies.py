@@ -4,7 +4,6 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NoReturn
@@ -19,7 +18,7 @@ from pyproj.exceptions import CRSError
 from pipeline.data.errors import InputError
 from tiler.editing.edit import City
 from tiler.editing.requests import ACTIONS, Asked, read_date
-from tiler.editing.uploads import Upload, Uploaded, read_upload
+from tiler.editing.uploads import HEIGHT, Upload, read_upload
 
 MOST_BYTES = 2**20  # of a body
 TEXT = {"type": "string", "minLength": 1, "maxLength": 200}
@@ -85,7 +84,7 @@ def make_asked(body: Mapping[str, Any], city: City) -> Asked:
             except InputError as error:
                 raise InputError(str(error).replace(f"{path}: ", "")) from None
     if upload is not None and "cityjson" not in body:
-        upload = _name(upload, body)
+        upload = upload.with_ids(body["building"])
     return Asked(
         *(body["action"], body.get("building", ""), upload, source),
         date=body.get("date", ""),
@@ -111,7 +110,8 @@ def _write_footprint(body: Mapping[str, Any], city: City, folder: Path) -> Path:
         raise InputError("footprint: is no polygon; send a GeoJSON Polygon")
     blob = np.array([shapely.to_wkb(shape)], np.object_)
     path = folder / "footprint.gpkg"
-    pyogrio.raw.write(path, blob, [], [], geometry_type=shape.geom_type, crs=crs)
+    height = {city.config.height_attribute or HEIGHT: np.array([body["height"]])} if "height" in body else {}
+    pyogrio.raw.write(path, blob, [*height.values()], [*height], geometry_type=shape.geom_type, crs=crs)
     return path
 
 
@@ -128,15 +128,6 @@ def _write_glb(body: Mapping[str, Any], city: City, folder: Path) -> Path:
     except ValueError as error:
         raise InputError(f"glb: is not in base64 ({error}); encode the file so") from None
     return path
-
-
-def _name(upload: Uploaded, body: Mapping[str, Any]) -> Uploaded:
-    """Give buildings the id of a body, and footprints its height."""
-    named = upload.with_ids(body["building"])
-    if "footprint" not in body:
-        return named
-    height = np.full(len(named.footprints.ids), body.get("height", np.nan), np.float64)
-    return replace(named, footprints=replace(named.footprints, given_height=height))
 
 
 WRITERS = {"footprint": _write_footprint, "cityjson": _write_model, "glb": _write_glb}
