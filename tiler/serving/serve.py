@@ -28,6 +28,7 @@ from tiler.tiles3d.view import PAGE, Files, show_until_interrupted
 from tiler.words.plain_text import say_nothing
 
 LEAST_TOKEN = 16  # characters
+EDITABLE = 625.0  # m; side of tiles up to which edits are quick, see `docs/edit.md`
 FOLDER = "view"  # below that of the run, with its 3D Tiles
 
 
@@ -120,6 +121,8 @@ def serve_city(
 
     with ExitStack() as stack:
         city = stack.enter_context(held_city(directory, workers, say))
+        if (side := city.config.tile_size_or_default) > EDITABLE:
+            say(f"tiles of {side:g} m: an edit makes a whole one anew; with --tile-size 500 it is done sooner")
         write_city_files(city)  # which a killed server has left
         write_tiles()
         open_executor = partial(_warm_executor, workers, city.config) if workers else nullcontext
