@@ -82,7 +82,7 @@ def load_blocks(directory: Path) -> tuple[City, int, int]:
         origin[2] = xyz[:, 2].min()
     city = City(
         points=xyz - origin,
-        facets=facets,
+        facets=facets.astype(np.int32),
         marker=np.concatenate(marker).astype(np.int32),
         building=np.concatenate(building),
         piece=np.zeros(len(facets), np.int32),

@@ -128,7 +128,7 @@ class City:
     ----------
     points : float64, (n, 3)
         Vertices (m) from `origin`, each once.
-    facets : int64, (k, 3)
+    facets : int32, (k, 3)
         Ground, walls and roofs, counter-clockwise seen from the air.
     marker : int32, (k,)
         `Marker` of each facet.
@@ -149,7 +149,7 @@ class City:
     """
 
     points: NDArray[np.float64]
-    facets: NDArray[np.int64]
+    facets: NDArray[np.int32]
     marker: NDArray[np.int32]
     building: NDArray[np.int64]
     piece: NDArray[np.int32]
@@ -250,7 +250,7 @@ def load_city(
     origin = np.array([*(low + high)[:2] / 2, low[2]])
     return City(
         points=xyz - origin,
-        facets=corners[:, ::-1],  # the file's look out of the air, which is where the camera is
+        facets=corners[:, ::-1].astype(np.int32),  # the file's look out of the air, which is where the camera is
         marker=found.marker,
         building=found.building,
         piece=found.piece,
@@ -268,7 +268,7 @@ def take_near(city: City, within: float) -> City:
         return city
     points, facets = sew(city.points, city.facets[near])
     rows = {name: getattr(city, name)[near] for name in ("marker", "building", "piece")}
-    return replace(city, points=points, facets=facets, **rows)
+    return replace(city, points=points, facets=facets.astype(np.int32), **rows)
 
 
 def load_levels(directory: Path, city: City) -> NDArray[np.int8]:
@@ -421,7 +421,7 @@ def find_outer_faces(
     return outer
 
 
-def sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def sew(points: NDArray[np.float64], facets: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Keep the points that facets use, equal ones once.
 
     Examples

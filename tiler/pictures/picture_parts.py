@@ -241,7 +241,7 @@ def make_skirt(city: City) -> Any:
     return pyvista.PolyData.from_regular_faces(np.vstack([city.points, foot]), quads).clean()
 
 
-def _make_surface(points: NDArray[np.float64], facets: NDArray[np.int64]) -> Any:
+def _make_surface(points: NDArray[np.float64], facets: NDArray[np.int32]) -> Any:
     """Make a surface of the points that facets use, in single precision, as VTK draws it."""
     import pyvista
 

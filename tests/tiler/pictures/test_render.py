@@ -233,7 +233,9 @@ def test_tiles_differ_from_the_eight_around_them() -> None:
     n = len(names)
     facets, marker = np.zeros((n, 3), np.int64), np.full(n, 3, np.int32)
     rows = np.arange(n)
-    city = City(np.zeros((1, 3)), facets, marker, rows, rows.astype(np.int32), tuple(names), np.zeros(3))
+    city = City(
+        np.zeros((1, 3)), facets.astype(np.int32), marker, rows, rows.astype(np.int32), tuple(names), np.zeros(3)
+    )
     rgb = tile_colours(city).reshape(4, 3, 3)
     for i, j in np.ndindex(4, 3):
         around = rgb[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2].reshape(-1, 3)
