@@ -25,9 +25,7 @@ from pipeline.simplification.shaping import (
 )
 
 CHAIN_TOLERANCE = 0.1  # m; 0.2 m saves 1 % of the walls more and costs a tenth of the area error more
-FINER_TOLERANCE = (
-    0.05  # m; of finer clusters: a step of 7 cm between a court and a high roof counts
-)
+FINER_TOLERANCE = 0.05  # m; of finer clusters: a step of 7 cm between a court and a high roof counts
 # A cluster is shaped again with a finer clearance where moved walls put the known roofs of more than `OFF_SHARE`
 # of its buildings off by more than `ROOF_OFF` (m, RMSE), or those of the median one by more than `MEDIAN_OFF`.
 ROOF_OFF, OFF_SHARE, MEDIAN_OFF = 0.5, 0.05, 0.15
