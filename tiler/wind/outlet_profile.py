@@ -17,7 +17,7 @@ from tiler.store.atomic import replacing
 from tiler.wind.results import Floats, WindCase, open_case, read_table, sampled_file
 
 FIELDS = {"U": 6, "k": 4, "epsilon": 4}  # numbers of a row: its place and its value
-LEVEL = 0.05  # m; 5 % of the speed at 0.5 m
+LEVEL = 0.05  # m; 3 % of the speed at 0.5 m
 ROW = 1.05  # faces of one row of the table: highest over lowest height, unless it has few faces
 FEW = 0.02  # of all
 
