@@ -1,6 +1,7 @@
 """Which level of detail of a building is taken, and what comes after it where it has no roof."""
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 
 from tiler.cityinput.faces import GROUND, NO_LOD, OUTLINE, ROOF, UNKNOWN, Faces, ModelBuilding, Shape, join_faces
 
@@ -19,7 +20,12 @@ def rank_levels(levels: Sequence[float], asked: str) -> list[float]:
     >>> rank_levels([1.2, 1.3, 2.2, 3.0], "auto"), rank_levels([1.2, 2.2, 3.0], "1.3")
     ([2.2, 3.0, 1.3, 1.2], [1.2, 2.2, 3.0])
     """
-    known = sorted({level for level in levels if level >= 1})
+    return list(_rank_levels(frozenset(levels), asked))
+
+
+@lru_cache
+def _rank_levels(levels: frozenset[float], asked: str) -> list[float]:
+    known = sorted(level for level in levels if level >= 1)
     none = [NO_LOD] if NO_LOD in levels else []
     if asked == "auto":
         roofs = [level for level in known if ROOFS <= level < OPENINGS]
@@ -37,21 +43,22 @@ def choose_shapes(building: ModelBuilding, asked: str) -> Iterator[tuple[float, 
     count where its parts have none that is better. None where the building has no level from 1 on.
     """
     shapes = [shape for shape in building.shapes if (shape.lod >= 1 or shape.lod == NO_LOD) and len(shape.faces)]
-    ranked = rank_levels([shape.lod for shape in shapes], asked)
-    of_level = {level: rank for rank, level in enumerate(ranked)}
-    of_owner: dict[str, list[tuple[int, Shape]]] = {}
-    for shape in shapes:
-        of_owner.setdefault(shape.owner, []).append((of_level[shape.lod], shape))
-    for first in range(len(ranked)):
+    levels = _rank_levels(frozenset(shape.lod for shape in shapes), asked)
+    ranked = [(levels.index(shape.lod), shape) for shape in shapes]
+    for first in range(len(levels)):
         chosen: list[Shape] = []
-        found = {owner: [rank for rank, _ in own if rank >= first] for owner, own in of_owner.items()}
-        best = {owner: min(ranks) for owner, ranks in found.items() if ranks}
-        others = min((rank for owner, rank in best.items() if owner != building.id), default=len(ranked))
-        for owner, rank in best.items():
-            if owner != building.id or rank <= others:
-                chosen += _of_one_kind([shape for own, shape in of_owner[owner] if own == rank])
+        best: dict[str, int] = {}
+        for rank, shape in ranked:
+            if first <= rank < best.get(shape.owner, len(levels)):
+                best[shape.owner] = rank
+        others = min((rank for owner, rank in best.items() if owner != building.id), default=len(levels))
+        for owner in dict.fromkeys(shape.owner for shape in shapes):
+            if owner in best and (owner != building.id or best[owner] <= others):
+                chosen += _of_one_kind(
+                    [shape for rank, shape in ranked if rank == best[owner] and shape.owner == owner]
+                )
         if chosen:
-            yield ranked[min(best.values())], chosen
+            yield levels[min(best.values())], chosen
 
 
 def best_shapes(building: ModelBuilding, asked: str) -> tuple[Shape, ...]:

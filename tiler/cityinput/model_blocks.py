@@ -102,11 +102,10 @@ def _make_block(batch: Sequence[ModelBuilding], frame: Frame, bounds: Box, wante
     ]
     near = shapely.intersects(rows.outlines, shapely.box(*bounds)) if len(rows) else np.zeros(0, np.bool_)
     counts["model buildings outside the region"] += int((~near).sum())
-    rows = take_rows(rows, np.flatnonzero(near & (length <= LONGEST)))
-    box = shapely.bounds(rows.outlines).reshape(-1, 4)
-    by_id = np.argsort(rows.ids, kind="stable")
-    order = by_id[order_by_cell((box[by_id, :2] + box[by_id, 2:]) / 2, ROW_CELL).order]
-    rows = take_rows(rows, order)
+    kept = np.flatnonzero(near & (length <= LONGEST))
+    kept = kept[np.argsort(rows.ids[kept], kind="stable")]
+    box = shapely.bounds(rows.outlines[kept]).reshape(-1, 4)
+    rows = take_rows(rows, kept[order_by_cell((box[:, :2] + box[:, 2:]) / 2, ROW_CELL).order])
     parts = [np.empty((0, 3))]
     classes = [np.empty(0, np.uint8)]
     if wanted.roof_points:
@@ -118,8 +117,8 @@ def _make_block(batch: Sequence[ModelBuilding], frame: Frame, bounds: Box, wante
         notes += _note_feet(rows)
     xyz, found = np.concatenate(parts), np.concatenate(classes)
     inside = _within(xyz, bounds)
-    kept = [note for note in notes if np.isnan(note.x) or _within(np.array([[note.x, note.y]]), bounds)[0]]
-    return ModelBlock(rows, xyz[inside], found[inside], tuple(kept), counts)
+    near_notes = [note for note in notes if np.isnan(note.x) or _within(np.array([[note.x, note.y]]), bounds)[0]]
+    return ModelBlock(rows, xyz[inside], found[inside], tuple(near_notes), counts)
 
 
 def _lengths(polygons: NDArray[np.object_]) -> Array:
