@@ -44,7 +44,9 @@ PROPERTY = {
     ]
 }
 CLASSES = closed(id=NAME, classes=some(closed(properties=some(PROPERTY))))
-TABLE = closed(class_=NAME, count=COUNT, properties=some(closed(values=INDEX, stringOffsets_=INDEX)))
+COLUMNS = some(closed(values=INDEX, stringOffsets_=INDEX))
+MEMBERS: Schema = {"class": NAME, "count": COUNT, "properties": COLUMNS}
+TABLE = closed(**MEMBERS)
 TILING = closed(
     subdivisionScheme={"const": "QUADTREE"}, availableLevels=COUNT, subtreeLevels=COUNT, subtrees=closed(uri=TEXT)
 )
