@@ -141,7 +141,7 @@ class City:
     origin : float64, (3,)
         Middle of the region, at the height of the lowest ground.
     quality : float32, (k,)
-        Radius ratio of the cell behind each facet; NaN where nobody asked.
+        Radius ratio of the cell behind each facet; none where nobody asked.
     step : float
         Vertices closer than some of this are one (m); 0 where all are shown.
     level : int8, (k,)
@@ -256,7 +256,7 @@ def load_city(
         piece=found.piece,
         names=tuple(path.stem for path in paths),
         origin=origin,
-        quality=found.quality,
+        quality=found.quality if quality else np.empty(0, np.float32),
         step=step,
     )
 
