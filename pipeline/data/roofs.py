@@ -7,8 +7,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.kernel import kernel
-
 # Where the roof of a building comes from: planes found in its points, a family of roofs fitted to them (gable,
 # hip, ...), the straight skeleton of its outline, one height, or the surfaces of a city model.
 ROOF_METHODS = ("planes", "family", "skeleton", "flat", "model")
@@ -101,22 +99,8 @@ def roof_heights(roofs: Roofs, row: NDArray[np.int64], xy: NDArray[np.float64]) 
     >>> roof_heights(shed, np.array([0, 0, 0]), np.array([[100.0, 7.0], [102.0, 0.0], [110.0, 0.0]])).tolist()
     [10.0, 11.0, 12.0]
     """
-    return np.asarray(_cut_heights(roofs.plane, roofs.origin, roofs.limits, row, xy))
-
-
-@kernel
-def _cut_heights(
-    plane: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    limits: NDArray[np.float64],
-    row: NDArray[np.int64],
-    xy: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    height = np.empty(len(row))
-    for k, r in enumerate(row):
-        a, b, c = plane[r]
-        z = a * (xy[k, 0] - origin[r, 0]) + b * (xy[k, 1] - origin[r, 1]) + c
-        height[k] = min(max(z, limits[r, 0]), limits[r, 1])
+    low, high = roofs.limits[row].T
+    height: NDArray[np.float64] = np.minimum(np.maximum(plane_heights(roofs, row, xy), low), high)
     return height
 
 
