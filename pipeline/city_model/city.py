@@ -53,57 +53,31 @@ class CityOptions:
 
 @dataclass(frozen=True, eq=False)
 class City:
-    """A city model with what is needed to go on from it.
+    """A city model with what is needed to go on from it."""
 
-    Attributes
-    ----------
-    model : CityModel
-        The buildings.
-    points : BuildingPoints
-        Their roof and ground points.
-    given_height : float64, (n,)
-        Height above ground (m) from an attribute, NaN where none.
-    forms : float64, (n, 6)
-        What attributes say of their roofs, by the columns of `roof_forms`.
-    roof_source : int8, (n,)
-        Where the roof's height comes from: index into `heights.ROOF_SOURCES`.
-    wall_ground : float64, (n,)
-        Highest terrain at the walls (m).
-    measured_roof : float64, (n,)
-        Roof heights (m) before roofs were grouped and raised.
-    group : int32, (n,)
-        Buildings of one group have one roof: the same height, and no wall between them.
-    row : int64, (n,)
-        Row of the footprint, or of the simplified building, that each was made of: those without a roof are gone.
-    notes : tuple of Note
-        What was dropped, repaired or defaulted on the way.
-    counts : dict
-        Numbers by name, for the report.
-    roof_method : int8, (n,)
-        Where the roof of the house of each comes from: index into `ROOF_METHODS`; `NOT_FITTED` with flat roofs.
-    roof_fallback : int8, (n,)
-        Why the roof of that house has one height: index into `ROOF_FALLBACKS`.
-    roof_form : int8, (n,)
-        The form of that house by an attribute: index into `ROOF_SHAPES`; negative where it has none.
-    outline : dict
-        How the simplified outlines compare with the footprints: ``area_error`` (share of all area that houses
-        lost or gained), ``min_clearance`` (m), ``sharpest`` (degrees); empty before simplification.
-    """
-
-    model: CityModel
-    points: BuildingPoints
-    given_height: NDArray[np.float64]
-    forms: NDArray[np.float64]
-    roof_source: NDArray[np.int8]
-    wall_ground: NDArray[np.float64]
-    measured_roof: NDArray[np.float64]
+    model: CityModel  #: the buildings
+    points: BuildingPoints  #: their roof and ground points
+    given_height: NDArray[np.float64]  #: (n,): height above ground (m) from an attribute, NaN where none
+    forms: NDArray[np.float64]  #: (n, 6): what attributes say of their roofs, by the columns of `roof_forms`
+    roof_source: NDArray[np.int8]  #: (n,): where the roof's height comes from: index into `heights.ROOF_SOURCES`
+    wall_ground: NDArray[np.float64]  #: (n,): highest terrain at the walls (m)
+    measured_roof: NDArray[np.float64]  #: (n,): roof heights (m) before roofs were grouped and raised
+    #: (n,): buildings of one group have one roof: the same height, and no wall between them
     group: NDArray[np.int32]
+    #: (n,): row of the footprint, or of the simplified building, that each was made of: those without a roof are
+    #: gone
     row: NDArray[np.int64]
+    #: (n,): where the roof of the house of each comes from: index into `ROOF_METHODS`; `NOT_FITTED` with flat
+    #: roofs
     roof_method: NDArray[np.int8]
+    #: (n,): why the roof of that house has one height: index into `ROOF_FALLBACKS`
     roof_fallback: NDArray[np.int8]
+    #: (n,): the form of that house by an attribute: index into `ROOF_SHAPES`; negative where it has none
     roof_form: NDArray[np.int8]
-    notes: tuple[Note, ...]
-    counts: dict[str, int]
+    notes: tuple[Note, ...]  #: what was dropped, repaired or defaulted on the way
+    counts: dict[str, int]  #: numbers by name, for the report
+    #: how the simplified outlines compare with the footprints: ``area_error`` (share of all area that houses lost
+    #: or gained), ``min_clearance`` (m), ``sharpest`` (degrees); empty before simplification
     outline: dict[str, float]
 
 

@@ -16,22 +16,13 @@ WALL_SAMPLE = 0.5  # m, distance between the places on a wall where the terrain 
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """Heights of ``n`` buildings and where they come from.
+    """Heights of ``n`` buildings and where they come from."""
 
-    Attributes
-    ----------
-    ground, roof : float64, (n,)
-        Absolute heights (m); `roof` is NaN where the source is "none".
-    roof_source : int8, (n,)
-        Index into `ROOF_SOURCES`.
-    ground_from_dtm : bool, (n,)
-        True where a building had no ground points.
-    """
-
+    #: (n,): absolute heights (m); `roof` is NaN where the source is "none"
     ground: NDArray[np.float64]
     roof: NDArray[np.float64]
-    roof_source: NDArray[np.int8]
-    ground_from_dtm: NDArray[np.bool_]
+    roof_source: NDArray[np.int8]  #: (n,): index into `ROOF_SOURCES`
+    ground_from_dtm: NDArray[np.bool_]  #: (n,): true where a building had no ground points
 
 
 def compute_building_heights(

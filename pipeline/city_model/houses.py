@@ -40,45 +40,21 @@ FULL_PRICE = 0.5  # share of the price of a cut that it has there
 
 @dataclass(frozen=True, eq=False)
 class Houses:
-    """Houses before simplification, and the parts that they were divided in.
+    """Houses before simplification, and the parts that they were divided in."""
 
-    Attributes
-    ----------
-    ids : str, (h,)
-        Ids of the houses.
-    polygons : object, (h,)
-        Their outlines (m).
-    given_height : float64, (h,)
-        Height above ground (m) from an attribute, NaN where none.
-    parts : HouseParts
-        Parts of all houses; a house that is not divided is its only part.
-    roofs : Roofs
-        Roof of each part, as its points tell; NaN where it has none, or one height is looked for.
-    method : int8, (h,)
-        Where the roof of each house comes from: index into `ROOF_METHODS`.
-    too_few : bool, (h,)
-        Houses with too few points for planes; none where one height is looked for.
-    form : int8, (h,)
-        The form of the roof by an attribute: index into `ROOF_SHAPES`; negative where there is none, or why it is
-        not used, by the codes of `roof_forms`.
-    points : BuildingPoints
-        Roof and ground points of each part.
-    notes : tuple of Note
-        What became of given forms, where the houses were divided just now.
-    full : HouseRoofs or None
-        Their division for the full city model, where it was asked for: closer to the points.
-    """
-
-    ids: NDArray[np.str_]
-    polygons: NDArray[np.object_]
-    given_height: NDArray[np.float64]
-    parts: HouseParts
-    roofs: Roofs
-    method: NDArray[np.int8]
-    too_few: NDArray[np.bool_]
+    ids: NDArray[np.str_]  #: (h,): ids of the houses
+    polygons: NDArray[np.object_]  #: (h,): their outlines (m)
+    given_height: NDArray[np.float64]  #: (h,): height above ground (m) from an attribute, NaN where none
+    parts: HouseParts  #: parts of all houses; a house that is not divided is its only part
+    roofs: Roofs  #: roof of each part, as its points tell; NaN where it has none, or one height is looked for
+    method: NDArray[np.int8]  #: (h,): where the roof of each house comes from: index into `ROOF_METHODS`
+    too_few: NDArray[np.bool_]  #: (h,): houses with too few points for planes; none where one height is looked for
+    #: (h,): the form of the roof by an attribute: index into `ROOF_SHAPES`; negative where there is none, or why
+    #: it is not used, by the codes of `roof_forms`
     form: NDArray[np.int8]
-    points: BuildingPoints
-    notes: tuple[Note, ...] = ()
+    points: BuildingPoints  #: roof and ground points of each part
+    notes: tuple[Note, ...] = ()  #: what became of given forms, where the houses were divided just now
+    #: their division for the full city model, where it was asked for: closer to the points
     full: HouseRoofs | None = None
 
     def __len__(self) -> int:

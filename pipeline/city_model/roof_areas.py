@@ -14,18 +14,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RoofAreas:
-    """Roofs over their ``n`` polygons.
+    """Roofs over their ``n`` polygons."""
 
-    Attributes
-    ----------
-    mean : float64, (n,)
-        Mean height (m): that of the flat roof of equal volume.
-    at_low, at_high : float64, (n,)
-        Area (m²) where the plane is below the lowest or above the highest height, and the roof flat; 0 where all
-        of it is.
-    """
-
-    mean: Array
+    mean: Array  #: (n,): mean height (m): that of the flat roof of equal volume
+    #: (n,): area (m²) where the plane is below the lowest or above the highest height, and the roof flat; 0 where
+    #: all of it is
     at_low: Array
     at_high: Array
 

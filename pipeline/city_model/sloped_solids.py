@@ -23,24 +23,12 @@ MAX_TILT = np.radians(10)  # of a triangle of a face against its plane; val3dity
 
 @dataclass(frozen=True, eq=False)
 class GridRoofs:
-    """Roofs of buildings on a grid.
+    """Roofs of buildings on a grid."""
 
-    Attributes
-    ----------
-    roofs : Roofs
-        The roofs, none lower than `ROOM` above the ground.
-    tolerance : float64, (n,)
-        Height (m) within which a plane is at a limit.
-    origin : float64, (3,)
-        Point of the grid coordinates (0, 0, 0) (m).
-    grid : float
-        Spacing (m).
-    """
-
-    roofs: Roofs
-    tolerance: NDArray[np.float64]
-    origin: NDArray[np.float64]
-    grid: float
+    roofs: Roofs  #: the roofs, none lower than `ROOM` above the ground
+    tolerance: NDArray[np.float64]  #: (n,): height (m) within which a plane is at a limit
+    origin: NDArray[np.float64]  #: (3,): point of the grid coordinates (0, 0, 0) (m)
+    grid: float  #: spacing (m)
 
     def heights(self, row: NDArray[np.int64], xy: NDArray[np.int64]) -> NDArray[np.int64]:
         """Heights of roofs at places, grid coordinates (k,) at (k, 2); where the plane is near a limit, that."""

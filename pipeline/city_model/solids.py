@@ -23,48 +23,27 @@ class Solids:
     Building ``i`` has the rings ``building_start[i]:building_start[i + 1]``: its shell, counter-clockwise
     seen from above, then its courtyards, clockwise. Ring ``r`` has the corners
     ``ring_start[r]:ring_start[r + 1]``, the first not repeated.
-
-    Attributes
-    ----------
-    building_start : int64, (n + 1,)
-        First ring of each building.
-    ring_start : int64, (r + 1,)
-        First corner of each ring.
-    low, high : int64, (k,)
-        Vertex of each corner at its building's ground and roof; -1 where there is no solid.
-    walls : int64, (k, 4)
-        Vertices of the wall from each corner to the next of its ring, counter-clockwise seen from outside.
-    has_solid : bool, (n,)
-        True where the roof is above the ground on the grid.
-    others : dict of int to list of Face
-        Faces of the buildings whose roof is several faces, by row: these hold instead of the prism.
     """
 
-    building_start: NDArray[np.int64]
-    ring_start: NDArray[np.int64]
+    building_start: NDArray[np.int64]  #: (n + 1,): first ring of each building
+    ring_start: NDArray[np.int64]  #: (r + 1,): first corner of each ring
+    #: (k,): vertex of each corner at its building's ground and roof; -1 where there is no solid
     low: NDArray[np.int64]
     high: NDArray[np.int64]
+    #: (k, 4): vertices of the wall from each corner to the next of its ring, counter-clockwise seen from outside
     walls: NDArray[np.int64]
-    has_solid: NDArray[np.bool_]
+    has_solid: NDArray[np.bool_]  #: (n,): true where the roof is above the ground on the grid
+    #: faces of the buildings whose roof is several faces, by row: these hold instead of the prism
     others: dict[int, list[Face]]
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Solids of buildings at several levels of detail, on an integer grid.
+    """Solids of buildings at several levels of detail, on an integer grid."""
 
-    Attributes
-    ----------
-    vertices : int64, (v, 3)
-        Grid coordinates, each vertex once, ascending by x, y, z.
-    footprints : Solids
-        The outlines at their ground: `low` alone, no building has a solid.
-    solids : tuple of Solids
-        A level each. Their outlines differ from `footprints` where rings meet, and under sloped roofs.
-    """
-
-    vertices: NDArray[np.int64]
-    footprints: Solids
+    vertices: NDArray[np.int64]  #: (v, 3): grid coordinates, each vertex once, ascending by x, y, z
+    footprints: Solids  #: the outlines at their ground: `low` alone, no building has a solid
+    #: a level each. Their outlines differ from `footprints` where rings meet, and under sloped roofs
     solids: tuple[Solids, ...]
 
 

@@ -90,17 +90,10 @@ def _count_cells(start: Index, xyz: Array, among: Mask) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class UnmarkedRoofs:
-    """What may be the roofs of houses, of points of other classes.
+    """What may be the roofs of houses, of points of other classes."""
 
-    Attributes
-    ----------
-    smooth : RoofPoints
-        Points on smooth surfaces above the terrain.
-    points : RoofPoints
-        These, and those between the lowest and the highest of them: dormers, ridges and steep gables are rough.
-    """
-
-    smooth: RoofPoints
+    smooth: RoofPoints  #: points on smooth surfaces above the terrain
+    #: these, and those between the lowest and the highest of them: dormers, ridges and steep gables are rough
     points: RoofPoints
 
 

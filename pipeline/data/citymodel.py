@@ -16,23 +16,14 @@ from pipeline.data.roofs import Roofs, highest_roofs, join_roofs, take_roofs
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Building footprints, one polygon a row.
+    """Building footprints, one polygon a row."""
 
-    Attributes
-    ----------
-    polygons : object, (n,)
-        shapely Polygons in the region's CRS (m), without Z, courtyards as holes.
-    ids : str, (n,)
-        Region-wide building id: the input's own, else made from the geometry.
-    given_height : float64, (n,)
-        Height above ground (m) from an attribute of the input; NaN where there is none.
-    forms : float64, (n, 6)
-        What attributes say of their roofs, by the columns of `roof_forms`; nothing by default.
-    """
-
+    #: (n,): shapely Polygons in the region's CRS (m), without Z, courtyards as holes
     polygons: NDArray[np.object_]
-    ids: NDArray[np.str_]
+    ids: NDArray[np.str_]  #: (n,): region-wide building id: the input's own, else made from the geometry
+    #: (n,): height above ground (m) from an attribute of the input; NaN where there is none
     given_height: NDArray[np.float64]
+    #: (n, 6): what attributes say of their roofs, by the columns of `roof_forms`; nothing by default
     forms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, N_COLUMNS)))
 
     def __post_init__(self) -> None:
@@ -50,27 +41,15 @@ def take_footprints(footprints: Footprints, rows: NDArray[np.integer[Any]] | NDA
 
 @dataclass(frozen=True, eq=False)
 class Prisms:
-    """Buildings, or parts of them, as prisms from the ground to a roof: what a mesh is made around.
+    """Buildings, or parts of them, as prisms from the ground to a roof: what a mesh is made around."""
 
-    Attributes
-    ----------
-    polygons : object, (n,)
-        shapely Polygons in the region's CRS (m): oriented (shell counter-clockwise), without Z.
-    ids : str, (n,)
-        Ids of the rows, each once; a merged building has the id of its largest member.
-    numbers : int64, (n,)
-        The same ids as numbers below 2**53, for formats without strings; see `number_ids`.
-    ground : float64, (n,)
-        Absolute ground height (m).
-    roofs : Roofs
-        Roofs, absolute heights (m).
-    """
-
+    #: (n,): shapely Polygons in the region's CRS (m): oriented (shell counter-clockwise), without Z
     polygons: NDArray[np.object_]
-    ids: NDArray[np.str_]
+    ids: NDArray[np.str_]  #: (n,): ids of the rows, each once; a merged building has the id of its largest member
+    #: (n,): the same ids as numbers below 2**53, for formats without strings; see `number_ids`
     numbers: NDArray[np.int64]
-    ground: NDArray[np.float64]
-    roofs: Roofs
+    ground: NDArray[np.float64]  #: (n,): absolute ground height (m)
+    roofs: Roofs  #: roofs, absolute heights (m)
 
     def __len__(self) -> int:
         return len(self.polygons)

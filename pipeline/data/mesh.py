@@ -59,20 +59,13 @@ def find_inside(marker: NDArray[np.int32], regions: Regions) -> NDArray[np.bool_
 
 @dataclass(frozen=True, eq=False)
 class PlaneMesh:
-    """Triangulation of the plane with the walls as edges (step 3.1).
+    """Triangulation of the plane with the walls as edges (step 3.1)."""
 
-    Attributes
-    ----------
-    xy : float64, (n, 2)
-        Vertices in the region's CRS (m), sorted by (x, y): local order is region-wide order.
-    triangles : int32, (m, 3)
-        Vertex indices, ascending in each row; orientation is that of the coordinates.
-    building : int32, (m,)
-        Row of the city model whose footprint holds the triangle, -1 on open ground.
-    """
-
+    #: (n, 2): vertices in the region's CRS (m), sorted by (x, y): local order is region-wide order
     xy: NDArray[np.float64]
+    #: (m, 3): vertex indices, ascending in each row; orientation is that of the coordinates
     triangles: NDArray[np.int32]
+    #: (m,): row of the city model whose footprint holds the triangle, -1 on open ground
     building: NDArray[np.int32]
 
 
@@ -82,36 +75,22 @@ MergeOrder = Literal["levels", "heights"]
 
 @dataclass(frozen=True, eq=False)
 class ColumnMesh:
-    """Columns of vertices over a plane mesh: the volume mesh until a file is written.
+    """Columns of vertices over a plane mesh: the volume mesh until a file is written."""
 
-    Attributes
-    ----------
-    plane : PlaneMesh
-        The triangles that the columns stand on.
-    z_start : int64, (n + 1,)
-        Column ``i`` has the levels ``z[z_start[i]:z_start[i + 1]]``.
-    z : float64, (z_start[-1],)
-        Heights of the levels (m), ascending in every column.
-    bottom : int32, (m, 3)
-        For each corner of a triangle, the level of that corner's column where the triangle's cells begin:
-        the ground, or the roof in a building.
-    order : "levels" or "heights"
-        Which column's next segment comes first where columns are merged into cells: the one with the most
-        segments left above it (the paper's equations 1-3), or the one whose middle is lowest. Ties go to
-        the highest vertex. Either order is that of two columns alone, so any cells that it makes conform.
-    key : float64, (z_start[-1],), optional
-        What takes the place of heights in the order "heights", ascending in every column: beside steep tops of
-        walls it differs from them. By default it is `z`.
-    moved : float64, (z_start[-1],), optional
-        Where roofs slope, by how much each level was moved that stands for one, for the sake of cells (m).
-    """
-
-    plane: PlaneMesh
-    z_start: NDArray[np.int64]
-    z: NDArray[np.float64]
+    plane: PlaneMesh  #: the triangles that the columns stand on
+    z_start: NDArray[np.int64]  #: (n + 1,): column ``i`` has the levels ``z[z_start[i]:z_start[i + 1]]``
+    z: NDArray[np.float64]  #: (z_start[-1],): heights of the levels (m), ascending in every column
+    #: (m, 3): for each corner of a triangle, the level of that corner's column where the triangle's cells begin:
+    #: the ground, or the roof in a building
     bottom: NDArray[np.int32]
+    #: which column's next segment comes first where columns are merged into cells: the one with the most segments
+    #: left above it (the paper's equations 1-3), or the one whose middle is lowest. Ties go to the highest vertex.
+    #: Either order is that of two columns alone, so any cells that it makes conform
     order: MergeOrder = "levels"
+    #: what takes the place of heights in the order "heights", ascending in every column: beside steep tops of
+    #: walls it differs from them. By default it is `z`
     key: NDArray[np.float64] | None = None
+    #: where roofs slope, by how much each level was moved that stands for one, for the sake of cells (m)
     moved: NDArray[np.float64] | None = None
 
     @property
@@ -122,57 +101,29 @@ class ColumnMesh:
 
 @dataclass(frozen=True, eq=False)
 class SeamEdges:
-    """Outer edges of a tile's plane mesh that are seams, and what lies beyond them.
+    """Outer edges of a tile's plane mesh that are seams, and what lies beyond them."""
 
-    Attributes
-    ----------
-    vertices : int32, (k, 2)
-        Vertices of each edge, ascending.
-    bottom : int32, (k, 2)
-        For each of the two, the level of its column where the cells beyond the edge begin. Not read where
-        `missing`.
-    building : int64, (k,)
-        Number of the building beyond, -1 on open ground.
-    missing : bool, (k,)
-        Whether there is no tile beyond.
-    """
-
-    vertices: NDArray[np.int32]
+    vertices: NDArray[np.int32]  #: (k, 2): vertices of each edge, ascending
+    #: (k, 2): for each of the two, the level of its column where the cells beyond the edge begin. Not read where
+    #: `missing`
     bottom: NDArray[np.int32]
-    building: NDArray[np.int64]
-    missing: NDArray[np.bool_]
+    building: NDArray[np.int64]  #: (k,): number of the building beyond, -1 on open ground
+    missing: NDArray[np.bool_]  #: (k,): whether there is no tile beyond
 
 
 @dataclass(frozen=True, eq=False)
 class TetMesh:
-    """Explicit tetrahedra.
+    """Explicit tetrahedra."""
 
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Vertices in the region's CRS (m).
-    cells : int32, (m, 4)
-        Vertex indices; ``det(p1 - p0, p2 - p0, p3 - p0) > 0`` in every row.
-    """
-
-    points: NDArray[np.float64]
-    cells: NDArray[np.int32]
+    points: NDArray[np.float64]  #: (n, 3): vertices in the region's CRS (m)
+    cells: NDArray[np.int32]  #: (m, 4): vertex indices; ``det(p1 - p0, p2 - p0, p3 - p0) > 0`` in every row
 
 
 @dataclass(frozen=True, eq=False)
 class Boundary:
-    """The boundary of a `TetMesh` as marked triangles.
+    """The boundary of a `TetMesh` as marked triangles."""
 
-    Attributes
-    ----------
-    facets : int32, (k, 3)
-        Indices of the mesh's points, counter-clockwise seen from outside the air.
-    marker : int32, (k,)
-        A `Marker` value each.
-    building : int64, (k,)
-        Number of the building (`CityModel.numbers`) that a wall or roof belongs to, -1 elsewhere.
-    """
-
-    facets: NDArray[np.int32]
-    marker: NDArray[np.int32]
+    facets: NDArray[np.int32]  #: (k, 3): indices of the mesh's points, counter-clockwise seen from outside the air
+    marker: NDArray[np.int32]  #: (k,): a `Marker` value each
+    #: (k,): number of the building (`CityModel.numbers`) that a wall or roof belongs to, -1 elsewhere
     building: NDArray[np.int64]

@@ -7,25 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Note:
-    """One thing that was not taken as it came.
+    """One thing that was not taken as it came."""
 
-    Attributes
-    ----------
-    kind : str
-        What happened, in kebab case, one fixed word per rule: ``"footprint-duplicate"``.
-    subject : str
-        Id of the building, name of the file, or ``""`` where the note has neither.
-    x, y : float
-        Place in the region's CRS (m); NaN where there is none.
-    detail : str
-        The observed value against its bound, in words, or ``""``.
-    """
-
-    kind: str
-    subject: str = ""
+    kind: str  #: what happened, in kebab case, one fixed word per rule: ``"footprint-duplicate"``
+    subject: str = ""  #: id of the building, name of the file, or ``""`` where the note has neither
+    #: place in the region's CRS (m); NaN where there is none
     x: float = float("nan")
     y: float = float("nan")
-    detail: str = ""
+    detail: str = ""  #: the observed value against its bound, in words, or ``""``
 
 
 def count_notes(notes: Iterable[Note]) -> dict[str, int]:

@@ -13,18 +13,10 @@ N_CLASSES = 256  # that a point may have
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points of one or several files.
+    """Points of one or several files."""
 
-    Attributes
-    ----------
-    xyz : float64, (n, 3)
-        Coordinates in the region's CRS, heights in the data's vertical datum (m).
-    classification : uint8, (n,)
-        ASPRS class of each point.
-    """
-
-    xyz: NDArray[np.float64]
-    classification: NDArray[np.uint8]
+    xyz: NDArray[np.float64]  #: (n, 3): coordinates in the region's CRS, heights in the data's vertical datum (m)
+    classification: NDArray[np.uint8]  #: (n,): ASPRS class of each point
 
     def __post_init__(self) -> None:
         n = len(self.xyz)

@@ -17,20 +17,13 @@ ROOF_FALLBACKS = ("", "no roof points", "few roof points")
 
 @dataclass(frozen=True, eq=False)
 class Roofs:
-    """Roofs of ``n`` building parts: at (x, y) each is ``a (x - x0) + b (y - y0) + c``, kept between two heights.
+    """Roofs of ``n`` building parts: at (x, y) each is ``a (x - x0) + b (y - y0) + c``, between two heights."""
 
-    Attributes
-    ----------
-    plane : float64, (n, 3)
-        Slopes ``a`` and ``b`` eastwards and northwards (m per m), and the height ``c`` at the origin (m).
-    origin : float64, (n, 2)
-        The origin ``x0, y0`` of each plane in the region's CRS: whole metres near the part.
-    limits : float64, (n, 2)
-        Lowest and highest height of each roof (m); both are ``c`` where a roof is flat.
-    """
-
+    #: (n, 3): slopes ``a`` and ``b`` eastwards and northwards (m per m), and the height ``c`` at the origin (m)
     plane: NDArray[np.float64]
+    #: (n, 2): the origin ``x0, y0`` of each plane in the region's CRS: whole metres near the part
     origin: NDArray[np.float64]
+    #: (n, 2): lowest and highest height of each roof (m); both are ``c`` where a roof is flat
     limits: NDArray[np.float64]
 
     def __len__(self) -> int:
@@ -39,25 +32,14 @@ class Roofs:
 
 @dataclass(frozen=True)
 class Weld:
-    """When heights of roofs at a vertex are joined or parted.
+    """When heights of roofs at a vertex are joined or parted."""
 
-    Attributes
-    ----------
-    factor : float
-        Least step of two roofs at a vertex, in vertical spacings of its column.
-    least, most : float
-        Limits of that step (m).
-    clearance : float
-        Least height of a roof above the terrain at a wall (m).
-    slack : float
-        How far roofs may be moved at a vertex where cells would be bad (m).
-    """
-
-    factor: float = 0.7
+    factor: float = 0.7  #: least step of two roofs at a vertex, in vertical spacings of its column
+    #: limits of that step (m)
     least: float = 1.0
     most: float = 2.5
-    clearance: float = 2.0
-    slack: float = 1.0
+    clearance: float = 2.0  #: least height of a roof above the terrain at a wall (m)
+    slack: float = 1.0  #: how far roofs may be moved at a vertex where cells would be bad (m)
 
 
 def flat_roofs(height: NDArray[np.float64]) -> Roofs:

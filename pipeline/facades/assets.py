@@ -22,23 +22,14 @@ LEAST_PANE = 0.1  # m
 
 @dataclass
 class Made:
-    """What assets have made of a façade.
+    """What assets have made of a façade."""
 
-    Attributes
-    ----------
-    wall : Surface
-        Its holes are those of the wall; its border is not used.
-    surfaces : list of Surface
-        Fill these holes: together with the wall they are closed.
-    installations : list of list of Surface
-        Balconies, each closed.
-    flat : dict of int to (Insert, (float, float))
-        The flat assets, with their lower left corners (m), by the number of their surface.
-    """
-
+    #: its holes are those of the wall; its border is not used
     wall: Surface = field(default_factory=lambda: Surface(WALL, [], []))
+    #: fill these holes: together with the wall they are closed
     surfaces: list[Surface] = field(default_factory=list)
-    installations: list[list[Surface]] = field(default_factory=list)
+    installations: list[list[Surface]] = field(default_factory=list)  #: balconies, each closed
+    #: the flat assets, with their lower left corners (m), by the number of their surface
     flat: dict[int, tuple[Insert, Flat]] = field(default_factory=dict)
 
     def count(self) -> int:

@@ -11,26 +11,17 @@ FULL, FLAT = 100, 0
 
 @dataclass(frozen=True)
 class Criteria:
-    """What decides; a criterion that is not given keeps everything.
+    """What decides; a criterion that is not given keeps everything."""
 
-    Attributes
-    ----------
-    viewpoint : (float, float, float) or None
-        Where from a city is seen (m); None leaves out distance and orientation.
-    full, reduced : float or None
-        Distances to the viewpoint (m) up to which all is kept, and from which on nothing; None for no criterion.
-    facing : float or None
-        Angle between the normal of a façade and the direction to the viewpoint (degrees) from which on nothing is
-        kept; up to its half all is.
-    keep : mapping of str to int
-        Per cent that are kept at least, by label.
-    """
-
+    #: (float, float, float): where from a city is seen (m); None leaves out distance and orientation
     viewpoint: Point | None = None
+    #: distances to the viewpoint (m) up to which all is kept, and from which on nothing; None for no criterion
     full: float | None = None
     reduced: float | None = None
+    #: angle between the normal of a façade and the direction to the viewpoint (degrees) from which on nothing is
+    #: kept; up to its half all is
     facing: float | None = None
-    keep: Mapping[str, int] = field(default_factory=dict)
+    keep: Mapping[str, int] = field(default_factory=dict)  #: per cent that are kept at least, by label
 
     def share(self, place: Point, normal: Point, labels: Iterable[str]) -> int:
         """Evaluate a product: per cent of polygons that are kept, 0 to 100.

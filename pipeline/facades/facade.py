@@ -20,14 +20,9 @@ Decide = Callable[[Flat, frozenset[str]], tuple[int, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where a façade is: the lower left corner of its rectangle, seen from outside, and its directions.
+    """Where a façade is: the lower left corner of its rectangle, seen from outside, and its directions."""
 
-    Attributes
-    ----------
-    origin, along, normal : float64, (3,)
-        The corner (m), the unit vector along the wall, and that outwards; both are horizontal.
-    """
-
+    #: (3,): the corner (m), the unit vector along the wall, and that outwards; both are horizontal
     origin: Array
     along: Array
     normal: Array
@@ -46,21 +41,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Product:
-    """An asset at its place on a façade.
+    """An asset at its place on a façade."""
 
-    Attributes
-    ----------
-    insert : Insert
-        The asset.
-    corner : (float, float)
-        Its lower left corner in the frame (m).
-    shares : tuple of int
-        Per cent of its polygons by each criterion that was asked for.
-    """
-
-    insert: Insert
-    corner: Flat
-    shares: tuple[int, ...]
+    insert: Insert  #: the asset
+    corner: Flat  #: its lower left corner in the frame (m)
+    shares: tuple[int, ...]  #: per cent of its polygons by each criterion that was asked for
 
     @property
     def box(self) -> tuple[Flat, Flat]:
@@ -168,20 +153,11 @@ def keep_in_wall(products: Sequence[Product], frame: Frame, rings: Sequence[Arra
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Borders of all faces of a building.
+    """Borders of all faces of a building."""
 
-    Attributes
-    ----------
-    xyz : float64, (n, 3)
-        Their vertices (m), one face after the other.
-    start : int64, (f,)
-        The first vertex of each.
-    normal, centre : float64, (f, 3)
-        Unit normal, or zero for a face without area, and a place in the plane of each.
-    """
-
-    xyz: Array
-    start: NDArray[np.int64]
+    xyz: Array  #: (n, 3): their vertices (m), one face after the other
+    start: NDArray[np.int64]  #: (f,): the first vertex of each
+    #: (f, 3): unit normal, or zero for a face without area, and a place in the plane of each
     normal: Array
     centre: Array
 

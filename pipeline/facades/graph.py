@@ -39,32 +39,18 @@ class Repeat:
 
 @dataclass(frozen=True)
 class Insert:
-    """Puts an asset into a rectangle, in the middle of its width.
+    """Puts an asset into a rectangle, in the middle of its width."""
 
-    Attributes
-    ----------
-    asset : str
-        ``"window"``, ``"door"`` or ``"balcony"``, which is its label too.
-    width, height : float
-        Its size on the wall (m).
-    sill : float
-        Its height above the lower edge of the rectangle (m).
-    depth : float
-        How deep it lies in the wall (m).
-    columns, rows : int
-        Number of its panes.
-    projection : float
-        How far a balcony reaches from the wall (m).
-    """
-
-    asset: str
+    asset: str  #: ``"window"``, ``"door"`` or ``"balcony"``, which is its label too
+    #: its size on the wall (m)
     width: float
     height: float
-    sill: float = 0.0
-    depth: float = 0.15
+    sill: float = 0.0  #: its height above the lower edge of the rectangle (m)
+    depth: float = 0.15  #: how deep it lies in the wall (m)
+    #: number of its panes
     columns: int = 1
     rows: int = 1
-    projection: float = 1.2
+    projection: float = 1.2  #: how far a balcony reaches from the wall (m)
 
     @property
     def label(self) -> str:
@@ -97,17 +83,10 @@ Node = Split | Repeat | Insert | ConditionalLod | InsertLod
 
 @dataclass(frozen=True)
 class Graph:
-    """Rules by name, in an order in which each comes before those that it leads to.
+    """Rules by name, in an order in which each comes before those that it leads to."""
 
-    Attributes
-    ----------
-    nodes : mapping of str to Node
-        The rules.
-    front, other : str
-        The rule that begins the widest façade of a building, and all others; ``""`` for none.
-    """
-
-    nodes: Mapping[str, Node]
+    nodes: Mapping[str, Node]  #: the rules
+    #: the rule that begins the widest façade of a building, and all others; ``""`` for none
     front: str
     other: str
 

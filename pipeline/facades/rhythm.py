@@ -28,19 +28,13 @@ class Beat:
 
 @dataclass(frozen=True)
 class Rhythm:
-    """A façade's storeys from below, its bays from the left, and the window of a bay.
+    """A façade's storeys from below, its bays from the left, and the window of a bay."""
 
-    Attributes
-    ----------
-    storeys, bays : Beat
-        What repeats upwards and to the right.
-    window : (float, float, float)
-        Width and height of a window, and its sill above the lower side of its storey (m); it is in the middle of
-        its bay.
-    """
-
+    #: what repeats upwards and to the right
     storeys: Beat
     bays: Beat
+    #: (float, float, float): width and height of a window, and its sill above the lower side of its storey (m); it
+    #: is in the middle of its bay
     window: tuple[float, float, float]
 
 

@@ -19,32 +19,18 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Borders:
-    """What the pieces of a tile share with each other and with other tiles.
+    """What the pieces of a tile share with each other and with other tiles."""
 
-    Attributes
-    ----------
-    area : float64, (n,)
-        Of each piece (m2).
-    pairs : int64, (p, 2)
-        Pieces that share a border, the lesser first, each pair once.
-    length : float64, (p,)
-        Of that border (m).
-    piece, side : int64, (s,)
-        Pieces on the sides of the tile, and which side: `WEST`, `EAST`, `SOUTH`, `NORTH`.
-    low, high : float64, (s,)
-        From where to where, along that side (m).
-    barrier : bool, (s,)
-        Whether a barrier runs along it.
-    """
-
-    area: Array
-    pairs: Index
-    length: Array
+    area: Array  #: (n,): of each piece (m2)
+    pairs: Index  #: (p, 2): pieces that share a border, the lesser first, each pair once
+    length: Array  #: (p,): of that border (m)
+    #: (s,): pieces on the sides of the tile, and which side: `WEST`, `EAST`, `SOUTH`, `NORTH`
     piece: Index
     side: Index
+    #: (s,): from where to where, along that side (m)
     low: Array
     high: Array
-    barrier: NDArray[np.bool_]
+    barrier: NDArray[np.bool_]  #: (s,): whether a barrier runs along it
 
 
 def partition_tile(segments: Array, box: Box, rim: shapely.Polygon) -> NDArray[np.object_]:

@@ -25,38 +25,21 @@ EVERYWHERE: Box = (-np.inf, -np.inf, np.inf, np.inf)
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Edges of all rings of some polygons.
+    """Edges of all rings of some polygons."""
 
-    Attributes
-    ----------
-    start : int64, (n + 1,)
-        Polygon ``i`` has the edges ``start[i]`` to ``start[i + 1]``.
-    a, b : float64, (m, 2)
-        From and to (m).
-    """
-
-    start: Index
+    start: Index  #: (n + 1,): polygon ``i`` has the edges ``start[i]`` to ``start[i + 1]``
+    #: (m, 2): from and to (m)
     a: Array
     b: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Rings:
-    """Closed rings of some polygons, one after the other.
+    """Closed rings of some polygons, one after the other."""
 
-    Attributes
-    ----------
-    start : int64, (n + 1,)
-        Polygon ``i`` has the vertices ``start[i]`` to ``start[i + 1]``.
-    xy : float64, (m, 2)
-        Vertices (m), the first of a ring again as its last.
-    ring : int64, (m,)
-        Ring of each vertex, ascending; the shell of a polygon comes first.
-    """
-
-    start: Index
-    xy: Array
-    ring: Index
+    start: Index  #: (n + 1,): polygon ``i`` has the vertices ``start[i]`` to ``start[i + 1]``
+    xy: Array  #: (m, 2): vertices (m), the first of a ring again as its last
+    ring: Index  #: (m,): ring of each vertex, ascending; the shell of a polygon comes first
 
 
 def read_rings(polygons: NDArray[np.object_]) -> Rings:
@@ -100,26 +83,14 @@ def _edges_of_rings(start: Index, xy: Array, ring: Index) -> tuple[Index, Array,
 
 @dataclass(frozen=True, eq=False)
 class PolygonIndex:
-    """Polygons listed in the square cells that they have a part of.
+    """Polygons listed in the square cells that they have a part of."""
 
-    Attributes
-    ----------
-    cells : tuple of int
-        Column and row of the first cell, number of columns and rows.
-    start : int64, (cells + 1,)
-        Cell ``c``, row by row, has the entries ``start[c]`` to ``start[c + 1]``.
-    polygon : int32, (m,)
-        Polygon of each entry.
-    edges : int64, (m, 2)
-        First and last of its edges that meet the row of cells; none where the whole cell is inside.
-    a, b : float64, (k, 2)
-        These edges, from and to (m).
-    """
-
-    cells: tuple[int, int, int, int]
-    start: Index
-    polygon: NDArray[np.int32]
+    cells: tuple[int, int, int, int]  #: column and row of the first cell, number of columns and rows
+    start: Index  #: (cells + 1,): cell ``c``, row by row, has the entries ``start[c]`` to ``start[c + 1]``
+    polygon: NDArray[np.int32]  #: (m,): polygon of each entry
+    #: (m, 2): first and last of its edges that meet the row of cells; none where the whole cell is inside
     edges: Index
+    #: (k, 2): these edges, from and to (m)
     a: Array
     b: Array
 
@@ -187,19 +158,13 @@ def find_inside(
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """Cells of the index that some polygons have a part of.
+    """Cells of the index that some polygons have a part of."""
 
-    Attributes
-    ----------
-    i0, j0 : int
-        Column and row of the first cell; cell (i, j) begins at ``i * INDEX_CELL``, ``j * INDEX_CELL``.
-    marked : bool, (rows, columns)
-        Whether a polygon has a part of the cell; it may be marked where one only comes within rounding of it.
-        There is at least one cell.
-    """
-
+    #: column and row of the first cell; cell (i, j) begins at ``i * INDEX_CELL``, ``j * INDEX_CELL``
     i0: int
     j0: int
+    #: (rows, columns): whether a polygon has a part of the cell; it may be marked where one only comes within
+    #: rounding of it. There is at least one cell
     marked: NDArray[np.bool_]
 
 

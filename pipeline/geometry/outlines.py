@@ -18,21 +18,11 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """A polygon by its rings.
+    """A polygon by its rings."""
 
-    Attributes
-    ----------
-    xy : float64, (n, 2)
-        Vertices (m) of its closed rings, one after the other, the shell first.
-    ring : int64, (n,)
-        Ring of each vertex, ascending.
-    given : shapely.Polygon or None
-        The polygon, where there is one.
-    """
-
-    xy: Array
-    ring: Index
-    given: shapely.Polygon | None = None
+    xy: Array  #: (n, 2): vertices (m) of its closed rings, one after the other, the shell first
+    ring: Index  #: (n,): ring of each vertex, ascending
+    given: shapely.Polygon | None = None  #: the polygon, where there is one
 
     @cached_property
     def polygon(self) -> shapely.Polygon:

@@ -23,21 +23,11 @@ AREA_TOLERANCE = 1e-6  # relative; triangles of a building against its footprint
 
 @dataclass(frozen=True, eq=False)
 class PlaneGraph:
-    """Planar straight-line graph: what the 2D mesher has to respect.
+    """Planar straight-line graph: what the 2D mesher has to respect."""
 
-    Attributes
-    ----------
-    xy : float64, (n, 2)
-        Vertices (m), no two alike.
-    segments : int32, (s, 2)
-        Edges of the region's border and of all walls, each once.
-    seeds : float64, (b, 2)
-        A place in each building, which labels the triangles around it.
-    """
-
-    xy: NDArray[np.float64]
-    segments: NDArray[np.int32]
-    seeds: NDArray[np.float64]
+    xy: NDArray[np.float64]  #: (n, 2): vertices (m), no two alike
+    segments: NDArray[np.int32]  #: (s, 2): edges of the region's border and of all walls, each once
+    seeds: NDArray[np.float64]  #: (b, 2): a place in each building, which labels the triangles around it
 
 
 def plane_graph(bounds: tuple[float, float, float, float], polygons: NDArray[np.object_]) -> PlaneGraph:

@@ -15,27 +15,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class SizeRule:
-    """How edges grow away from walls.
+    """How edges grow away from walls."""
 
-    Attributes
-    ----------
-    mesh_size : float
-        Target edge length at walls (m).
-    open_size : float
-        The largest (m), above that at walls.
-    grading : float
-        By how much it grows for each metre away from walls.
-    wall_size : float
-        Finer length at walls (m), in the plane alone; 0 for none.
-    wall_grading : float
-        By how much that grows for each metre away from walls.
-    """
-
-    mesh_size: float
-    open_size: float
-    grading: float
-    wall_size: float = 0.0
-    wall_grading: float = 0.0
+    mesh_size: float  #: target edge length at walls (m)
+    open_size: float  #: the largest (m), above that at walls
+    grading: float  #: by how much it grows for each metre away from walls
+    wall_size: float = 0.0  #: finer length at walls (m), in the plane alone; 0 for none
+    wall_grading: float = 0.0  #: by how much that grows for each metre away from walls
 
     @property
     def reach(self) -> float:
@@ -55,44 +41,23 @@ class SizeRule:
 
 @dataclass(frozen=True, eq=False)
 class Finer:
-    """A bound on sizes around some shapes.
+    """A bound on sizes around some shapes."""
 
-    Attributes
-    ----------
-    size : float
-        Target edge length in and on them (m).
-    growth : float
-        By how much it grows for each metre away from them.
-    shapes : STRtree
-        Areas or lines.
-    upright : bool
-        Whether the vertical spacing follows.
-    """
-
-    size: float
-    growth: float
-    shapes: shapely.STRtree
-    upright: bool = True
+    size: float  #: target edge length in and on them (m)
+    growth: float  #: by how much it grows for each metre away from them
+    shapes: shapely.STRtree  #: areas or lines
+    upright: bool = True  #: whether the vertical spacing follows
 
 
 @dataclass(frozen=True, eq=False)
 class SizeField:
-    """A rule, and the walls that distances count from.
+    """A rule, and the walls that distances count from."""
 
-    Attributes
-    ----------
-    rule : SizeRule
-        The rule.
-    walls : STRtree
-        What distances count from: walls as lines, at least all within the rule's reach of the places that are
-        asked for.
-    finer : tuple of Finer
-        What makes sizes finer than the rule.
-    """
-
-    rule: SizeRule
+    rule: SizeRule  #: the rule
+    #: what distances count from: walls as lines, at least all within the rule's reach of the places that are asked
+    #: for
     walls: shapely.STRtree
-    finer: tuple[Finer, ...] = ()
+    finer: tuple[Finer, ...] = ()  #: what makes sizes finer than the rule
 
     @property
     def smallest(self) -> float:

@@ -24,21 +24,12 @@ BLOCK = 256  # rows of nodes at a time
 
 @dataclass(frozen=True, eq=False)
 class Border:
-    """Terrain along the border of a region.
+    """Terrain along the border of a region."""
 
-    Attributes
-    ----------
-    z : float64, (n,)
-        Height (m) of the outermost nodes of its raster, counter-clockwise from the lower left one.
-    rim : float
-        Height at the outer sides of the margin (m).
-    window : NodeWindow
-        Nodes of the region.
-    """
-
+    #: (n,): height (m) of the outermost nodes of its raster, counter-clockwise from the lower left one
     z: NDArray[np.float64]
-    rim: float
-    window: NodeWindow
+    rim: float  #: height at the outer sides of the margin (m)
+    window: NodeWindow  #: nodes of the region
 
 
 def border_nodes(window: NodeWindow) -> NDArray[np.int64]:

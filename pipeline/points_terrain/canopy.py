@@ -15,26 +15,17 @@ DENSITIES = np.round(0.1 * 1.4 ** np.arange(11), 3)
 
 @dataclass(frozen=True, eq=False)
 class Canopy:
-    """Canopies in square columns, aligned with the CRS; row ``j``, column ``i`` of arrays (ny, nx).
+    """Canopies in square columns, aligned with the CRS; row ``j``, column ``i`` of arrays (ny, nx)."""
 
-    Attributes
-    ----------
-    base, top : float64
-        Absolute heights (m); NaN where there is none.
-    density : float32
-        Leaf area density (m2/m3), one of `DENSITIES`, or what is given; 0 where there is no canopy.
-    i0, j0 : int
-        Indices of the first column: it reaches from ``i0 * size`` to ``(i0 + 1) * size``.
-    size : float
-        Side of a column (m).
-    """
-
+    #: absolute heights (m); NaN where there is none
     base: NDArray[np.float64]
     top: NDArray[np.float64]
+    #: leaf area density (m2/m3), one of `DENSITIES`, or what is given; 0 where there is no canopy
     density: NDArray[np.float32]
+    #: indices of the first column: it reaches from ``i0 * size`` to ``(i0 + 1) * size``
     i0: int
     j0: int
-    size: float
+    size: float  #: side of a column (m)
 
 
 def find_canopy(

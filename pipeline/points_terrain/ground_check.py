@@ -44,13 +44,13 @@ def compare_ground(
     """
     n_cells = len(start) - 1
     chosen = np.arange(0, len(z), max(len(z) // SAMPLE, 1))
-    cell = np.searchsorted(start, chosen, side="right") - 1
+    cell = np.repeat(np.arange(n_cells), np.diff(start))[chosen]
     z, classification = z[chosen], classification[chosen]
     ground, other = classification == GROUND, classification <= UNCLASSIFIED
     n_ground, n_other = (np.bincount(cell[rows], minlength=n_cells) for rows in (ground, other))
     enough = (n_ground >= LEAST_POINTS) & (n_other >= np.maximum(LEAST_POINTS, LEAST_SHARE * n_ground))
     mean, deviation = [], []
-    for rows, n in ((ground, n_ground), (other, n_other)):
+    for rows, n in ((ground & enough[cell], n_ground), (other & enough[cell], n_other)):
         centre = np.bincount(cell[rows], z[rows], n_cells) / np.maximum(n, 1)
         squares = np.bincount(cell[rows], (z[rows] - centre[cell[rows]]) ** 2, n_cells) / np.maximum(n, 1)
         mean.append(centre[enough])

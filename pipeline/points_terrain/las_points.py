@@ -20,22 +20,13 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class UnitPoints:
-    """Points of one file in its own units.
+    """Points of one file in its own units."""
 
-    Attributes
-    ----------
-    units : int32, (n, 3)
-        Coordinates in units of the file, as in `find_coordinates`.
-    scale, offset : tuple of 3 floats
-        Size of a unit along each axis, and place of unit 0 (m).
-    classification : uint8, (n,)
-        ASPRS class of each point.
-    """
-
-    units: NDArray[np.int32]
+    units: NDArray[np.int32]  #: (n, 3): coordinates in units of the file, as in `find_coordinates`
+    #: size of a unit along each axis, and place of unit 0 (m)
     scale: Triple
     offset: Triple
-    classification: NDArray[np.uint8]
+    classification: NDArray[np.uint8]  #: (n,): ASPRS class of each point
 
 
 @kernel

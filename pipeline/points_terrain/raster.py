@@ -20,38 +20,24 @@ Value = TypeVar("Value", bound=np.generic)
 
 @dataclass(frozen=True, eq=False)
 class Dtm:
-    """Ground heights at the nodes of a grid that is aligned with the CRS.
+    """Ground heights at the nodes of a grid that is aligned with the CRS."""
 
-    Attributes
-    ----------
-    z : float64, (ny, nx)
-        Height (m) at node ``(x, y) = ((i0 + i) * spacing, (j0 + j) * spacing)``, row ``j``, column ``i``.
-    i0, j0 : int
-        Region-wide index of the first column and row: the same node has the same index in every tile.
-    spacing : float
-        Distance between nodes (m).
-    """
-
+    #: (ny, nx): height (m) at node ``(x, y) = ((i0 + i) * spacing, (j0 + j) * spacing)``, row ``j``, column ``i``
     z: NDArray[np.float64]
+    #: region-wide index of the first column and row: the same node has the same index in every tile
     i0: int
     j0: int
-    spacing: float
+    spacing: float  #: distance between nodes (m)
 
 
 @dataclass(frozen=True)
 class NodeWindow:
-    """A rectangle of nodes.
+    """A rectangle of nodes."""
 
-    Attributes
-    ----------
-    i0, j0 : int
-        Region-wide index of the first column and row.
-    nx, ny : int
-        Columns and rows, 0 or more.
-    """
-
+    #: region-wide index of the first column and row
     i0: int
     j0: int
+    #: columns and rows, 0 or more
     nx: int
     ny: int
 

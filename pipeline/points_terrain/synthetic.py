@@ -42,46 +42,24 @@ _GROUND_SIGMA, _ROOF_SIGMA = 0.03, 0.05  # m
 
 @dataclass(frozen=True, eq=False)
 class SyntheticCity:
-    """Hills, a pond and buildings on a square.
+    """Hills, a pond and buildings on a square."""
 
-    Attributes
-    ----------
-    size : float
-        Side of the square (m); its lower left corner is `ORIGIN`.
-    density : float
-        Points per square metre.
-    seed : int
-        What all of it was drawn from.
-    waves : float64, (8, 4)
-        Terrain as a sum of sines: wave numbers in x and y (1/m), phase, amplitude (m).
-    base : float
-        Height (m) to which the waves are added.
-    pond : float64, (4,)
-        Centre x, y, radius and water level (m); the shore is blended into the hills over one more radius.
-    polygons : object, (n,)
-        Footprints as shapely Polygons, coordinates on whole millimetres.
-    ids : str, (n,)
-        Their ids.
-    ground, roof : float64, (n,)
-        Terrain at the centroid, and the flat roof above it, or the highest place of another roof (m, absolute).
-    roofs : str
-        One of `ROOFS`.
-    shapes : RoofShapes
-        The roofs.
-    """
-
-    size: float
-    density: float
-    seed: int
+    size: float  #: side of the square (m); its lower left corner is `ORIGIN`
+    density: float  #: points per square metre
+    seed: int  #: what all of it was drawn from
+    #: (8, 4): terrain as a sum of sines: wave numbers in x and y (1/m), phase, amplitude (m)
     waves: NDArray[np.float64]
-    base: float
+    base: float  #: height (m) to which the waves are added
+    #: (4,): centre x, y, radius and water level (m); the shore is blended into the hills over one more radius
     pond: NDArray[np.float64]
-    polygons: NDArray[np.object_]
-    ids: NDArray[np.str_]
+    polygons: NDArray[np.object_]  #: (n,): footprints as shapely Polygons, coordinates on whole millimetres
+    ids: NDArray[np.str_]  #: (n,): their ids
+    #: (n,): terrain at the centroid, and the flat roof above it, or the highest place of another roof (m,
+    #: absolute)
     ground: NDArray[np.float64]
     roof: NDArray[np.float64]
-    roofs: str
-    shapes: RoofShapes
+    roofs: str  #: one of `ROOFS`
+    shapes: RoofShapes  #: the roofs
 
 
 class _Counts(NamedTuple):

@@ -23,33 +23,18 @@ _MOST_PLANES = 8
 
 @dataclass(frozen=True, eq=False)
 class RoofShapes:
-    """Roofs of ``n`` houses: over a wing the lowest of its planes, where wings overlap the higher of both.
+    """Roofs of ``n`` houses: over a wing the lowest of its planes, where wings overlap the higher of both."""
 
-    Attributes
-    ----------
-    kind : int8, (n,)
-        Index into `ROOF_TYPES`.
-    eaves : float64, (n,)
-        Height of the eaves; of a flat roof its height (m, absolute).
-    start : int64, (n + 1,)
-        House ``i`` has the wings ``start[i]`` to ``start[i + 1]``: two of an L-shape with a sloped roof, else one.
-    centre : float64, (w, 2)
-        Middle of each wing's rectangle in the city's CRS (m).
-    axis : float64, (w, 2)
-        Unit vector along its ridge.
-    half : float64, (w, 2)
-        Half of its length along the ridge and of its width (m).
-    plane : float64, (w, 8, 3)
-        Planes: slopes eastwards and northwards, and height above the wing's centre (m); those not used are at an
-        infinite height.
-    """
-
-    kind: NDArray[np.int8]
-    eaves: NDArray[np.float64]
+    kind: NDArray[np.int8]  #: (n,): index into `ROOF_TYPES`
+    eaves: NDArray[np.float64]  #: (n,): height of the eaves; of a flat roof its height (m, absolute)
+    #: (n + 1,): house ``i`` has the wings ``start[i]`` to ``start[i + 1]``: two of an L-shape with a sloped roof,
+    #: else one
     start: NDArray[np.int64]
-    centre: NDArray[np.float64]
-    axis: NDArray[np.float64]
-    half: NDArray[np.float64]
+    centre: NDArray[np.float64]  #: (w, 2): middle of each wing's rectangle in the city's CRS (m)
+    axis: NDArray[np.float64]  #: (w, 2): unit vector along its ridge
+    half: NDArray[np.float64]  #: (w, 2): half of its length along the ridge and of its width (m)
+    #: (w, 8, 3): planes: slopes eastwards and northwards, and height above the wing's centre (m); those not used
+    #: are at an infinite height
     plane: NDArray[np.float64]
 
     def __len__(self) -> int:

@@ -30,63 +30,34 @@ COARSE = 64  # nodes between two coarse nodes
 
 @dataclass(frozen=True, eq=False)
 class FloodedDtm:
-    """Terrain with its small empty areas filled.
+    """Terrain with its small empty areas filled."""
 
-    Attributes
-    ----------
-    dtm : Dtm
-        Heights (m), NaN where `ring` is `DEEPER`.
-    ring : uint8, (ny, nx)
-        Nodes to the closest one with ground points, along the larger of the two axes: 0 for those themselves,
-        `DEEPER` for all that are farther than `FILL_RINGS`.
-    """
-
-    dtm: Dtm
+    dtm: Dtm  #: heights (m), NaN where `ring` is `DEEPER`
+    #: (ny, nx): nodes to the closest one with ground points, along the larger of the two axes: 0 for those
+    #: themselves, `DEEPER` for all that are farther than `FILL_RINGS`
     ring: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
 class CoarseSums:
-    """What tiles tell of their large empty areas. Small: has entries only where there are any.
+    """What tiles tell of their large empty areas. Small: has entries only where there are any."""
 
-    Attributes
-    ----------
-    node : int64, (k, 2)
-        Region-wide column and row of coarse nodes, sorted. Coarse node ``(i, j)`` is node ``(i, j) * COARSE``.
-    total : int64, (k,)
-        Sum of the heights of the rim nodes closest to each, in `HEIGHT_UNIT`.
-    count : int64, (k,)
-        How many these are, at least 1.
-    window : NodeWindow
-        Nodes from which the sums were made.
-    n_known : int
-        Nodes with ground points among them.
-    spacing : float
-        Distance between nodes (m).
-    """
-
+    #: (k, 2): region-wide column and row of coarse nodes, sorted. Coarse node ``(i, j)`` is node ``(i, j) *
+    #: COARSE``
     node: NDArray[np.int64]
-    total: NDArray[np.int64]
-    count: NDArray[np.int64]
-    window: NodeWindow
-    n_known: int
-    spacing: float
+    total: NDArray[np.int64]  #: (k,): sum of the heights of the rim nodes closest to each, in `HEIGHT_UNIT`
+    count: NDArray[np.int64]  #: (k,): how many these are, at least 1
+    window: NodeWindow  #: nodes from which the sums were made
+    n_known: int  #: nodes with ground points among them
+    spacing: float  #: distance between nodes (m)
 
 
 @dataclass(frozen=True)
 class FillCounts:
-    """How many nodes have no ground point of their own.
+    """How many nodes have no ground point of their own."""
 
-    Attributes
-    ----------
-    filled : int
-        All of them.
-    coarse : int
-        Those whose height is wholly or partly from the coarse level.
-    """
-
-    filled: int
-    coarse: int
+    filled: int  #: all of them
+    coarse: int  #: those whose height is wholly or partly from the coarse level
 
 
 def flood_terrain(raw: Dtm, window: NodeWindow) -> FloodedDtm:

@@ -20,21 +20,13 @@ QUALITY_BINS = {
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """Values counted in bins of equal width.
+    """Values counted in bins of equal width."""
 
-    Attributes
-    ----------
-    low, high : float
-        Range of the bins. Values beyond it are counted in the first and the last one.
-    counts : int64, (b,)
-        Values in each bin.
-    minimum, maximum : float
-        Least and greatest value, exact; infinity and minus infinity if there are none.
-    """
-
+    #: range of the bins. Values beyond it are counted in the first and the last one
     low: float
     high: float
-    counts: NDArray[np.int64]
+    counts: NDArray[np.int64]  #: (b,): values in each bin
+    #: least and greatest value, exact; infinity and minus infinity if there are none
     minimum: float
     maximum: float
 

@@ -50,39 +50,24 @@ COVERAGE_CELL = 1.0  # m, side of the cells in which points are looked for
 
 @dataclass(frozen=True)
 class PointFidelity:
-    """Distance of a point cloud to a city model. The points of the four fields are disjoint.
+    """Distance of a point cloud to a city model. The points of the four fields are disjoint."""
 
-    Attributes
-    ----------
-    roof : Residuals
-        Roof points inside a building of the model, against its roof.
-    missed : Residuals
-        Roof points inside an original footprint, but outside all buildings of the model, against the terrain
-        that the model has there: houses that were dropped, rims that were cut off.
-    ground : Residuals
-        Ground points outside all buildings of the model, against the terrain.
-    swallowed : Residuals
-        Ground points inside a building of the model, but outside all original footprints, against its roof:
-        streets and courtyards that were built over. (Ground points inside both are floors and passages, which
-        the model does not have; they are not counted.)
-    """
-
-    roof: Residuals
+    roof: Residuals  #: roof points inside a building of the model, against its roof
+    #: roof points inside an original footprint, but outside all buildings of the model, against the terrain that
+    #: the model has there: houses that were dropped, rims that were cut off
     missed: Residuals
-    ground: Residuals
+    ground: Residuals  #: ground points outside all buildings of the model, against the terrain
+    #: ground points inside a building of the model, but outside all original footprints, against its roof: streets
+    #: and courtyards that were built over. (Ground points inside both are floors and passages, which the model
+    #: does not have; they are not counted.)
     swallowed: Residuals
 
 
 @dataclass(frozen=True, eq=False)
 class FidelitySums:
-    """Sums of a tile's points from which the fidelity of a region is made.
+    """Sums of a tile's points from which the fidelity of a region is made."""
 
-    Attributes
-    ----------
-    roof, missed, ground, swallowed : ResidualSums
-        Of the points that `PointFidelity` describes.
-    """
-
+    #: of the points that `PointFidelity` describes
     roof: ResidualSums
     missed: ResidualSums
     ground: ResidualSums
@@ -91,31 +76,18 @@ class FidelitySums:
 
 @dataclass(frozen=True, eq=False)
 class HouseFidelity:
-    """Fidelity of each of ``n`` houses.
+    """Fidelity of each of ``n`` houses."""
 
-    Attributes
-    ----------
-    n_points : int64, (n,)
-        Number of roof points.
-    rmse : float64, (n,)
-        Root of the mean squared height of the roof over its points (m); NaN without points or roof.
-    bias : float64, (n,)
-        Mean of the roof's height over its points (m); NaN likewise.
-    coverage : float64, (n,)
-        Share of the 1 m cells of the footprint that have a roof point, 0 to 1. A cell belongs to it if its
-        centre is inside or a roof point of the house lies in it. 0 without points.
-    median : float64, (n,)
-        Median distance of the points from the roof, up or down (m); NaN without points or roof.
-    within : float64, (n,)
-        Share of the points within `NEAR` of the roof, 0 to 1; NaN likewise.
-    """
-
-    n_points: NDArray[np.int64]
+    n_points: NDArray[np.int64]  #: (n,): number of roof points
+    #: (n,): root of the mean squared height of the roof over its points (m); NaN without points or roof
     rmse: NDArray[np.float64]
-    bias: NDArray[np.float64]
+    bias: NDArray[np.float64]  #: (n,): mean of the roof's height over its points (m); NaN likewise
+    #: (n,): share of the 1 m cells of the footprint that have a roof point, 0 to 1. A cell belongs to it if its
+    #: centre is inside or a roof point of the house lies in it. 0 without points
     coverage: NDArray[np.float64]
+    #: (n,): median distance of the points from the roof, up or down (m); NaN without points or roof
     median: NDArray[np.float64]
-    within: NDArray[np.float64]
+    within: NDArray[np.float64]  #: (n,): share of the points within `NEAR` of the roof, 0 to 1; NaN likewise
 
 
 def measure_fidelity(
@@ -161,21 +133,11 @@ def measure_fidelity(
 
 @dataclass(frozen=True, eq=False)
 class IndexedModel:
-    """A city model and the footprints that it was made of, in which points are looked for.
+    """A city model and the footprints that it was made of, in which points are looked for."""
 
-    Attributes
-    ----------
-    polygons : object, (n,)
-        Buildings that have a roof, then footprints.
-    roofs : Roofs
-        Roofs of the first ``b``, the buildings.
-    index : PolygonIndex
-        All of them in cells.
-    """
-
-    polygons: NDArray[np.object_]
-    roofs: Roofs
-    index: PolygonIndex
+    polygons: NDArray[np.object_]  #: (n,): buildings that have a roof, then footprints
+    roofs: Roofs  #: roofs of the first ``b``, the buildings
+    index: PolygonIndex  #: all of them in cells
 
 
 def index_model(

@@ -14,20 +14,12 @@ PERCENTILES = (0.0, 0.1, 1.0, 5.0, 50.0, 95.0, 99.0, 99.9, 100.0)
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """Measures of each cell.
+    """Measures of each cell."""
 
-    Attributes
-    ----------
-    radius_ratio : float32, (m,)
-        3 x inscribed over circumscribed radius: 1 for the regular tetrahedron, 0 for a flat one.
-    min_dihedral : float32, (m,)
-        Smallest of the six dihedral angles (degrees): 70.5 at best.
-    aspect_ratio : float32, (m,)
-        Longest edge over 2 sqrt(6) inscribed radii: 1 at best, infinite for a flat one.
-    """
-
+    #: (m,): 3 x inscribed over circumscribed radius: 1 for the regular tetrahedron, 0 for a flat one
     radius_ratio: NDArray[np.float32]
-    min_dihedral: NDArray[np.float32]
+    min_dihedral: NDArray[np.float32]  #: (m,): smallest of the six dihedral angles (degrees): 70.5 at best
+    #: (m,): longest edge over 2 sqrt(6) inscribed radii: 1 at best, infinite for a flat one
     aspect_ratio: NDArray[np.float32]
 
 

@@ -16,47 +16,24 @@ HISTOGRAM_BINS = 5_000  # of 1 cm
 
 @dataclass(frozen=True)
 class Residuals:
-    """Heights of the model minus heights of the points.
+    """Heights of the model minus heights of the points."""
 
-    Attributes
-    ----------
-    n : int
-        Number of points; the other values are NaN if there are none.
-    rmse : float
-        Root of the mean square (m).
-    p50, p95 : float
-        Percentiles of the absolute values (m).
-    bias : float
-        Mean (m), positive where the model is too high.
-    """
-
-    n: int
-    rmse: float
+    n: int  #: number of points; the other values are NaN if there are none
+    rmse: float  #: root of the mean square (m)
+    #: percentiles of the absolute values (m)
     p50: float
     p95: float
-    bias: float
+    bias: float  #: mean (m), positive where the model is too high
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualSums:
-    """Sums of residuals.
+    """Sums of residuals."""
 
-    Attributes
-    ----------
-    n : int
-        Number of points.
-    total : int
-        Sum of the residuals, each rounded to 1e-4 m, in this unit.
-    squares : int
-        Sum of their squares, in this unit squared. It may exceed 64 bits.
-    absolute : Histogram
-        Absolute values (m) in bins of 1 cm up to 50 m.
-    """
-
-    n: int
-    total: int
-    squares: int
-    absolute: Histogram
+    n: int  #: number of points
+    total: int  #: sum of the residuals, each rounded to 1e-4 m, in this unit
+    squares: int  #: sum of their squares, in this unit squared. It may exceed 64 bits
+    absolute: Histogram  #: absolute values (m) in bins of 1 cm up to 50 m
 
 
 def sum_residuals(residual: NDArray[np.float64]) -> ResidualSums:

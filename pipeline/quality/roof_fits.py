@@ -18,21 +18,14 @@ CLIPPED, COVERED, SPARSE = 0.2, 0.5, 1.0  # shares of the area, and points a m2,
 
 @dataclass
 class RoofFits:
-    """Collects the fit of buildings, block by block, and the houses of largest RMSE with their worst parts.
+    """Collects the fit of buildings, block by block, and the houses of largest RMSE with their worst parts."""
 
-    Attributes
-    ----------
-    method : list of int8 (n,)
-        Index into `ROOF_METHODS` of the buildings of each block.
-    values : list of float64 (n, 4)
-        Number of points, RMSE (m), median distance (m) and share within 0.25 m of each.
-    worst : list of dict
-        Of a house: ``id``, ``method``, ``parts``, ``points``, ``rmse`` (m), ``within``, ``worst_part``, which adds
-        most to the RMSE, its place ``x``, ``y`` (m), and ``why``, what is known of it.
-    """
-
+    #: index into `ROOF_METHODS` of the buildings of each block
     method: list[NDArray[np.int8]] = field(default_factory=list)
+    #: each (n, 4): number of points, RMSE (m), median distance (m) and share within 0.25 m of each
     values: list[NDArray[np.float64]] = field(default_factory=list)
+    #: of a house: ``id``, ``method``, ``parts``, ``points``, ``rmse`` (m), ``within``, ``worst_part``, which adds
+    #: most to the RMSE, its place ``x``, ``y`` (m), and ``why``, what is known of it
     worst: list[dict[str, Any]] = field(default_factory=list)
 
     def add(

@@ -20,47 +20,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class FoundRoof:
-    """The roof of a house in a city model.
+    """The roof of a house in a city model."""
 
-    Attributes
-    ----------
-    faces : object, (f,)
-        Its faces in plan, shapely Polygons (m).
-    planes : float64, (f, 3)
-        ``z = a x + b y + c`` of each (m).
-    outline : shapely geometry
-        What the house covers (m).
-    """
-
-    faces: NDArray[np.object_]
-    planes: Array
-    outline: shapely.Geometry
+    faces: NDArray[np.object_]  #: (f,): its faces in plan, shapely Polygons (m)
+    planes: Array  #: (f, 3): ``z = a x + b y + c`` of each (m)
+    outline: shapely.Geometry  #: what the house covers (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """How a roof differs from its truth.
+    """How a roof differs from its truth."""
 
-    Attributes
-    ----------
-    kind : str
-        True type of the main roof, one of `TYPES`.
-    same_type, same_planes : bool
-        Whether the main roof is of this type, and whether all roofs of the house have as many planes as in truth.
-    angles : float64, (p,)
-        Angle between each true plane of the main roof and the one found there (degrees).
-    outline : float
-        Area by which outlines differ over the length of the true one (m).
-    errors : float64, (n,)
-        Found less true heights of the main roof, at places of a grid (m).
-    """
-
-    kind: str
+    kind: str  #: true type of the main roof, one of `TYPES`
+    #: whether the main roof is of this type, and whether all roofs of the house have as many planes as in truth
     same_type: bool
     same_planes: bool
-    angles: Array
-    outline: float
-    errors: Array
+    angles: Array  #: (p,): angle between each true plane of the main roof and the one found there (degrees)
+    outline: float  #: area by which outlines differ over the length of the true one (m)
+    errors: Array  #: (n,): found less true heights of the main roof, at places of a grid (m)
 
 
 def make_roof(faces: Sequence[Sequence[Array]], ground: Sequence[shapely.Polygon]) -> FoundRoof:

@@ -33,67 +33,36 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class RoofForm:
-    """The roof that is wanted, as by ``roof:shape``, ``roof:height``, ``roof:angle``, ``roof:direction`` of OSM.
+    """The roof that is wanted, as by ``roof:shape``, ``roof:height``, ``roof:angle``, ``roof:direction``."""
 
-    Attributes
-    ----------
-    shape : str
-        One of `ROOF_SHAPES`.
-    slope : float
-        Slope of the steepest part (m per m), of a mansard roof on the whole; not used if a height is given.
-    height : float, optional
-        Height of the highest ridge above the eaves (m).
-    direction : float, optional
-        Where a skillion roof looks, downhill: degrees clockwise from north. If none is given, towards the longest
-        edge. A gabled, half-hipped or gambrel roof over four sides has its gables where it looks least.
-    across : bool
-        Whether the ridge of such a roof over four sides runs along the shorter ones, where no direction is given.
-    gables : sequence of int, optional
-        Edges, numbered as by `outline_edges`, that are gables of a gabled, half-hipped or gambrel roof. If
-        none are given, those that `find_gables` finds.
-    """
-
-    shape: str = "hipped"
+    shape: str = "hipped"  #: one of `ROOF_SHAPES`
+    #: slope of the steepest part (m per m), of a mansard roof on the whole; not used if a height is given
     slope: float = DEFAULT_SLOPE
-    height: float | None = None
+    height: float | None = None  #: height of the highest ridge above the eaves (m)
+    #: where a skillion roof looks, downhill: degrees clockwise from north. If none is given, towards the longest
+    #: edge. A gabled, half-hipped or gambrel roof over four sides has its gables where it looks least
     direction: float | None = None
+    #: whether the ridge of such a roof over four sides runs along the shorter ones, where no direction is given
     across: bool = False
+    #: edges, numbered as by `outline_edges`, that are gables of a gabled, half-hipped or gambrel roof. If none are
+    #: given, those that `find_gables` finds
     gables: Sequence[int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ShapedRoof:
-    """A roof of ``p`` parts over one polygon.
+    """A roof of ``p`` parts over one polygon."""
 
-    Attributes
-    ----------
-    shape : str
-        The shape that was made: "hipped" where a pyramidal one was wanted over an outline that has none.
-    nodes : float64, (n, 2)
-        Places of all vertices (m) in the CRS of the polygon, its own to the bit.
-    height : float64, (n,)
-        Height of the roof there (m).
-    part_start : int64, (p + 1,)
-        Part ``i`` has the nodes ``part_node[part_start[i]:part_start[i + 1]]``.
-    part_node : int64, (k,)
-        Nodes around each part, counter-clockwise. Parts beside each other have all nodes between them in common.
-        None for a flat or skillion roof.
-    edge : int64, (p,)
-        Edge of the outline that each part rises from; -1 for a flat or skillion roof.
-    roofs : Roofs
-        Plane and limits of each part.
-    polygon : shapely.Polygon
-        The outline in canonical form.
-    """
-
-    shape: str
-    nodes: Array
-    height: Array
-    part_start: Index
+    shape: str  #: the shape that was made: "hipped" where a pyramidal one was wanted over an outline that has none
+    nodes: Array  #: (n, 2): places of all vertices (m) in the CRS of the polygon, its own to the bit
+    height: Array  #: (n,): height of the roof there (m)
+    part_start: Index  #: (p + 1,): part ``i`` has the nodes ``part_node[part_start[i]:part_start[i + 1]]``
+    #: (k,): nodes around each part, counter-clockwise. Parts beside each other have all nodes between them in
+    #: common. None for a flat or skillion roof
     part_node: Index
-    edge: Index
-    roofs: Roofs
-    polygon: shapely.Polygon
+    edge: Index  #: (p,): edge of the outline that each part rises from; -1 for a flat or skillion roof
+    roofs: Roofs  #: plane and limits of each part
+    polygon: shapely.Polygon  #: the outline in canonical form
 
     def __len__(self) -> int:
         return len(self.edge)

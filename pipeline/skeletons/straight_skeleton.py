@@ -28,36 +28,20 @@ class Skeleton:
     Edges are numbered along the rings of the polygon in canonical form (`make_canonical`): the outline
     counter-clockwise, then courtyards clockwise, so that the polygon is on their left. Where the vertex of a
     courtyard lies on an edge of another ring, it divides that edge in two.
-
-    Attributes
-    ----------
-    nodes : float64, (n, 2)
-        Places (m) in the CRS of the polygon: its vertices, to the bit, then the nodes inside.
-    time : float64, (n,)
-        When the wavefront reaches each node: its distance from each of its edges, divided by their speed.
-    edges : int64, (m, 2)
-        Nodes where each edge starts and ends.
-    speed : float64, (m,)
-        Distance that each edge moves in a unit of time.
-    start : float64, (m,)
-        Time when each edge sets off.
-    face_start : int64, (m + 1,)
-        The face of edge ``e`` has the nodes ``face_node[face_start[e]:face_start[e + 1]]``.
-    face_node : int64, (k,)
-        Nodes of each face, counter-clockwise, the two ends of its edge first. An edge of speed 0 has a face
-        without area, one that sets off later a part without area below its other nodes.
-    origin : float64, (2,)
-        Whole metres near the polygon; the work is done in coordinates relative to it.
     """
 
-    nodes: Array
+    nodes: Array  #: (n, 2): places (m) in the CRS of the polygon: its vertices, to the bit, then the nodes inside
+    #: (n,): when the wavefront reaches each node: its distance from each of its edges, divided by their speed
     time: Array
-    edges: Index
-    speed: Array
-    start: Array
+    edges: Index  #: (m, 2): nodes where each edge starts and ends
+    speed: Array  #: (m,): distance that each edge moves in a unit of time
+    start: Array  #: (m,): time when each edge sets off
+    #: (m + 1,): the face of edge ``e`` has the nodes ``face_node[face_start[e]:face_start[e + 1]]``
     face_start: Index
+    #: (k,): nodes of each face, counter-clockwise, the two ends of its edge first. An edge of speed 0 has a face
+    #: without area, one that sets off later a part without area below its other nodes
     face_node: Index
-    origin: Array
+    origin: Array  #: (2,): whole metres near the polygon; the work is done in coordinates relative to it
 
     def __len__(self) -> int:
         return len(self.edges)

@@ -31,22 +31,15 @@ Nodes = tuple[int, int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class SlabShape:
-    """How the layers of a slab differ from equal ones that all follow the terrain by Laplace's equation.
+    """How the layers of a slab differ from equal ones that all follow the terrain by Laplace's equation."""
 
-    Attributes
-    ----------
-    levels : float64, (n_layers + 1,)
-        Heights of the levels on flat ground (m), from 0 to the slab's thickness.
-    calm : float
-        Height (m) below which the equation's levels turn, with its square, into those that stand at their heights
-        above the terrain; 0 if none do. Thin layers would otherwise follow the slope, and cross small bumps.
-    top : float or None
-        Absolute height of a flat top (m), to which levels are drawn with the square of their height; None leaves
-        the top as the equation has it.
-    """
-
+    #: (n_layers + 1,): heights of the levels on flat ground (m), from 0 to the slab's thickness
     levels: NDArray[np.float64]
+    #: height (m) below which the equation's levels turn, with its square, into those that stand at their heights
+    #: above the terrain; 0 if none do. Thin layers would otherwise follow the slope, and cross small bumps
     calm: float
+    #: absolute height of a flat top (m), to which levels are drawn with the square of their height; None leaves
+    #: the top as the equation has it
     top: float | None
 
 
@@ -210,24 +203,14 @@ def _clip(low: NDArray[np.float64], high: NDArray[np.float64], region: Bounds) -
 
 @dataclass(frozen=True, eq=False)
 class _SquareLift:
-    """How the terrain in a window lifts the levels in a square of it: the same for all squares that lie alike.
+    """How the terrain in a window lifts the levels in a square of it: the same for all squares that lie alike."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Cells of the window's grid along x and y.
-    nodes : (int, int, int, int)
-        Nodes around the square, as from `_nodes_around`.
-    along_y, along_x : float64, (r, ny + 1) and (nx + 1, c)
-        What each mode adds at their rows and at their columns.
-    damping : float64, (n_layers, ny + 1, nx + 1)
-        What is left of each mode at every level but the ground.
-    """
-
-    shape: tuple[int, int]
-    nodes: Nodes
+    shape: tuple[int, int]  #: (int, int): cells of the window's grid along x and y
+    nodes: Nodes  #: (int, int, int, int): nodes around the square, as from `_nodes_around`
+    #: (r, ny + 1) and (nx + 1, c): what each mode adds at their rows and at their columns
     along_y: NDArray[np.float64]
     along_x: NDArray[np.float64]
+    #: (n_layers, ny + 1, nx + 1): what is left of each mode at every level but the ground
     damping: NDArray[np.float64]
 
     def __call__(self, dtm: Dtm, xy: NDArray[np.float64], window: Bounds) -> NDArray[np.float64]:

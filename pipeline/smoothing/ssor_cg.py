@@ -18,23 +18,13 @@ RELAXATION = 1.6  # omega; 1.3 to 1.7 take about the same iterations, the smooth
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
-    """Strictly lower part of the scaled matrix of ``n`` columns of ``l`` levels over ``e`` plane edges.
+    """Strictly lower part of the scaled matrix of ``n`` columns of ``l`` levels over ``e`` plane edges."""
 
-    Attributes
-    ----------
-    edges : int32, (e, 2)
-        Columns of each edge, ascending and sorted.
-    start : int64, (n + 1,)
-        First edge of each column, as its lower one.
-    scale : float32, (n, l)
-        Root of omega over the diagonal; 0 where the unknown is given, which takes it out of the couplings.
-    up, level, slant : float32, (n, l - 1), (e, l) and (e, l - 1)
-        Scaled couplings, as in `Stencil`.
-    """
-
-    edges: NDArray[np.int32]
-    start: NDArray[np.int64]
+    edges: NDArray[np.int32]  #: (e, 2): columns of each edge, ascending and sorted
+    start: NDArray[np.int64]  #: (n + 1,): first edge of each column, as its lower one
+    #: (n, l): root of omega over the diagonal; 0 where the unknown is given, which takes it out of the couplings
     scale: NDArray[np.float32]
+    #: (n, l - 1), (e, l) and (e, l - 1): scaled couplings, as in `Stencil`
     up: NDArray[np.float32]
     level: NDArray[np.float32]
     slant: NDArray[np.float32]

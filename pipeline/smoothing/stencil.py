@@ -16,23 +16,12 @@ from pipeline.data.mesh import PlaneMesh
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
-    """Stiffness matrix of ``n`` columns of ``l`` levels over ``e`` plane edges.
+    """Stiffness matrix of ``n`` columns of ``l`` levels over ``e`` plane edges."""
 
-    Attributes
-    ----------
-    diagonal : float64, (n, l)
-        Diagonal; 0 where no cell uses the vertex.
-    up : float64, (n, l - 1)
-        Coupling of level k with level k + 1 of the same column.
-    level : float64, (e, l)
-        Coupling of the same level of the edge's two columns.
-    slant : float64, (e, l - 1)
-        Coupling of level k of the edge's first column with level k + 1 of its second.
-    """
-
-    diagonal: NDArray[np.float64]
-    up: NDArray[np.float64]
-    level: NDArray[np.float64]
+    diagonal: NDArray[np.float64]  #: (n, l): diagonal; 0 where no cell uses the vertex
+    up: NDArray[np.float64]  #: (n, l - 1): coupling of level k with level k + 1 of the same column
+    level: NDArray[np.float64]  #: (e, l): coupling of the same level of the edge's two columns
+    #: (e, l - 1): coupling of level k of the edge's first column with level k + 1 of its second
     slant: NDArray[np.float64]
 
 

@@ -16,28 +16,16 @@ from stitch.pieces.face_mates import CROWDED, FACES, NO_MATE, find_mates, take_f
 
 @dataclass(frozen=True, eq=False)
 class CellFaces:
-    """The faces of a piece of ``m`` cells: ``i`` inside, ``f`` on the boundary, ``s`` shared with other pieces.
+    """The faces of a piece of ``m`` cells: ``i`` inside, ``f`` on the boundary, ``s`` shared with other pieces."""
 
-    Attributes
-    ----------
-    owner, neighbour : int32, (i,)
-        The two cells of each face inside, ``owner < neighbour``, sorted by owner, then by neighbour.
-    inner : int32, (i, 3)
-        Their vertices, counter-clockwise seen from the neighbour: the normal points out of the owner.
-    facet_cell : int32, (f,)
-        Cell of each boundary facet, in the order in which facets were given.
-    shared_cell : int32, (s,)
-        Cell of each face that is neither, ascending.
-    shared : int32, (s, 3)
-        Their vertices, counter-clockwise seen from outside the piece.
-    """
-
+    #: (i,): the two cells of each face inside, ``owner < neighbour``, sorted by owner, then by neighbour
     owner: NDArray[np.int32]
     neighbour: NDArray[np.int32]
+    #: (i, 3): their vertices, counter-clockwise seen from the neighbour: the normal points out of the owner
     inner: NDArray[np.int32]
-    facet_cell: NDArray[np.int32]
-    shared_cell: NDArray[np.int32]
-    shared: NDArray[np.int32]
+    facet_cell: NDArray[np.int32]  #: (f,): cell of each boundary facet, in the order in which facets were given
+    shared_cell: NDArray[np.int32]  #: (s,): cell of each face that is neither, ascending
+    shared: NDArray[np.int32]  #: (s, 3): their vertices, counter-clockwise seen from outside the piece
 
 
 def find_cell_faces(cells: NDArray[np.int32], facets: NDArray[np.int32], n_points: int) -> CellFaces:

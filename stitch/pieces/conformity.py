@@ -18,67 +18,37 @@ FLAT = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class FacePairs:
-    """How faces meet.
+    """How faces meet."""
 
-    Attributes
-    ----------
-    exterior : int32, (k, 3)
-        Faces that occur once, oriented outwards, in the order of the input.
-    same_side : int32, (s, 3)
-        Faces that occur twice in the same orientation: two cells overlap, or one is inverted.
-    shared : int32, (t, 3)
-        Faces that occur three times or more, one row for each occurrence.
-    row : int64, (k,)
-        The face of the input, or the cell, that each exterior face is of.
-    part : int32, (m,)
-        Of cells: the part of each, from 0. Cells of one part hang together by faces of two cells. Of loose faces
-        none.
-    """
-
-    exterior: NDArray[np.int32]
+    exterior: NDArray[np.int32]  #: (k, 3): faces that occur once, oriented outwards, in the order of the input
+    #: (s, 3): faces that occur twice in the same orientation: two cells overlap, or one is inverted
     same_side: NDArray[np.int32]
-    shared: NDArray[np.int32]
-    row: NDArray[np.int64]
+    shared: NDArray[np.int32]  #: (t, 3): faces that occur three times or more, one row for each occurrence
+    row: NDArray[np.int64]  #: (k,): the face of the input, or the cell, that each exterior face is of
+    #: (m,): of cells: the part of each, from 0. Cells of one part hang together by faces of two cells. Of loose
+    #: faces none
     part: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
 class EdgePairs:
-    """How the edges of a triangle surface meet.
+    """How the edges of a triangle surface meet."""
 
-    Attributes
-    ----------
-    open : int32, (k, 2)
-        Edges that facets do not use equally often in both directions: the surface has a hole or a
-        facet is turned over.
-    non_manifold : int32, (m, 2)
-        Matched edges of more than two facets, as where two buildings touch in a corner: allowed.
-    """
-
+    #: (k, 2): edges that facets do not use equally often in both directions: the surface has a hole or a facet is
+    #: turned over
     open: NDArray[np.int32]
+    #: (m, 2): matched edges of more than two facets, as where two buildings touch in a corner: allowed
     non_manifold: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Faces of one surface against those of another, as row numbers.
+    """Faces of one surface against those of another, as row numbers."""
 
-    Attributes
-    ----------
-    missing : int64, (k,)
-        Rows of the first that the second lacks.
-    extra : int64, (k,)
-        Rows of the second that the first lacks.
-    flipped : int64, (k,)
-        Rows of the second that are in the first in the other orientation.
-    duplicate : int64, (k,)
-        Rows of the second that repeat an earlier row, in either orientation.
-    """
-
-    missing: NDArray[np.int64]
-    extra: NDArray[np.int64]
-    flipped: NDArray[np.int64]
-    duplicate: NDArray[np.int64]
+    missing: NDArray[np.int64]  #: (k,): rows of the first that the second lacks
+    extra: NDArray[np.int64]  #: (k,): rows of the second that the first lacks
+    flipped: NDArray[np.int64]  #: (k,): rows of the second that are in the first in the other orientation
+    duplicate: NDArray[np.int64]  #: (k,): rows of the second that repeat an earlier row, in either orientation
 
 
 def pair_cell_faces(cells: NDArray[np.int32], n_points: int) -> FacePairs:

@@ -23,73 +23,45 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Rim:
-    """What a piece has over its rim.
+    """What a piece has over its rim."""
 
-    Attributes
-    ----------
-    edges : float64, (k, 2, 2)
-        Plan edges (m), from start to end with the piece on the left.
-    faces : float64, (f, 3, 3)
-        Exterior faces of the piece over these edges, pointing out of it.
-    is_boundary : bool, (f,)
-        Whether the piece says that a face is the boundary of the whole mesh.
-    part : int64, (f,)
-        Number of the part of the mesh that the cell behind a face belongs to, no two pieces have one in common.
-    side : int8, (f,)
-        `pipeline.data.mesh.Region` of that cell; `MARKED` more where the piece says that the face is what air and
-        a building share.
-    lines : float64, (l, 2, 3)
-        Edges of boundary facets, from start to end, each as often as it occurs, with both ends over the rim.
-    points : float64, (p, 4)
-        Points over the rim, with the number of a kind: what is counted once of each place and kind.
-    """
-
-    edges: Vertices
-    faces: Vertices
-    is_boundary: Mask
+    edges: Vertices  #: (k, 2, 2): plan edges (m), from start to end with the piece on the left
+    faces: Vertices  #: (f, 3, 3): exterior faces of the piece over these edges, pointing out of it
+    is_boundary: Mask  #: (f,): whether the piece says that a face is the boundary of the whole mesh
+    #: (f,): number of the part of the mesh that the cell behind a face belongs to, no two pieces have one in
+    #: common
     part: NDArray[np.int64]
+    #: (f,): `pipeline.data.mesh.Region` of that cell; `MARKED` more where the piece says that the face is what air
+    #: and a building share
     side: NDArray[np.int8]
+    #: (l, 2, 3): edges of boundary facets, from start to end, each as often as it occurs, with both ends over the
+    #: rim
     lines: Vertices
+    #: (p, 4): points over the rim, with the number of a kind: what is counted once of each place and kind
     points: Vertices
 
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """What has been found out about places that no further piece can meet.
+    """What has been found out about places that no further piece can meet."""
 
-    Attributes
-    ----------
-    n_matched : int
-        Faces that two pieces have, in opposite orientations.
-    seams, joined : int64, (s, 2)
-        Numbers of the pieces that share them, and of the parts that hang together by them, each pair once.
-    open : float64, (k, 3, 3)
-        Faces that are not on the boundary and that no other piece has.
-    extra : float64, (e, 3, 3)
-        Faces that a piece says are on the boundary although another piece has them too.
-    same_side, shared : float64, (t, 3, 3)
-        Faces of two pieces in the same orientation, and of more than two.
-    mixed : float64, (m, 3, 3)
-        Faces of cells that are not of one region, or are air and building, but not marked as such, or are marked
-        and something else.
-    open_lines, crowded_lines : float64, (l, 2, 3)
-        Boundary edges that facets do not use equally often in both directions, and others of more than two
-        facets; each once.
-    n_walls : int
-        How many of the matched faces are walls between air and a building with cells.
-    """
-
-    n_matched: int
+    n_matched: int  #: faces that two pieces have, in opposite orientations
+    #: (s, 2): numbers of the pieces that share them, and of the parts that hang together by them, each pair once
     seams: NDArray[np.int64]
     joined: NDArray[np.int64]
-    open: Vertices
-    extra: Vertices
+    open: Vertices  #: (k, 3, 3): faces that are not on the boundary and that no other piece has
+    extra: Vertices  #: (e, 3, 3): faces that a piece says are on the boundary although another piece has them too
+    #: (t, 3, 3): faces of two pieces in the same orientation, and of more than two
     same_side: Vertices
     shared: Vertices
+    #: (m, 3, 3): faces of cells that are not of one region, or are air and building, but not marked as such, or
+    #: are marked and something else
     mixed: Vertices
+    #: (l, 2, 3): boundary edges that facets do not use equally often in both directions, and others of more than
+    #: two facets; each once
     open_lines: Vertices
     crowded_lines: Vertices
-    n_walls: int = 0
+    n_walls: int = 0  #: how many of the matched faces are walls between air and a building with cells
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,19 +36,12 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Numbering:
-    """From ids to numbers without gaps, 0 to ``n_points - 1``, in the order of the ids.
+    """From ids to numbers without gaps, 0 to ``n_points - 1``, in the order of the ids."""
 
-    Attributes
-    ----------
-    start, stop : int64, (r,)
-        Runs of ids that follow each other: from ``start`` to before ``stop``, ascending and apart.
-    offset : int64, (r + 1,)
-        Number of the first id of each run, and of all points.
-    """
-
+    #: (r,): runs of ids that follow each other: from ``start`` to before ``stop``, ascending and apart
     start: Ints
     stop: Ints
-    offset: Ints
+    offset: Ints  #: (r + 1,): number of the first id of each run, and of all points
 
     @property
     def n_points(self) -> int:
@@ -58,22 +51,13 @@ class Numbering:
 
 @dataclass(frozen=True, eq=False)
 class PartCounts:
-    """Points of a tile.
+    """Points of a tile."""
 
-    Attributes
-    ----------
-    own : int
-        Points of no seam.
-    part, levels : int64, (p,)
-        Codes of the tile's seams and corners, and how many levels each has.
-    unused : int64, (u,)
-        Ids of those levels that the tile has no cell at: the tiles around it may have one.
-    """
-
-    own: int
+    own: int  #: points of no seam
+    #: (p,): codes of the tile's seams and corners, and how many levels each has
     part: Ints
     levels: Ints
-    unused: Ints
+    unused: Ints  #: (u,): ids of those levels that the tile has no cell at: the tiles around it may have one
 
 
 def corner_part(key: Key) -> int:

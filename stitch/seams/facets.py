@@ -14,22 +14,13 @@ from stitch.seams.seams import Seam, find_vertices
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """A seam as one of its two tiles sees it.
+    """A seam as one of its two tiles sees it."""
 
-    Attributes
-    ----------
-    seam : Seam
-        A seam within the region.
-    left : bool
-        Whether the tile is on the seam's left, looking from its first corner to its last. A tile is on the
-        left of its southern and eastern seam, and on the right of its northern and western one.
-    missing : bool
-        Whether the tile on the other side is not there.
-    """
-
-    seam: Seam
+    seam: Seam  #: a seam within the region
+    #: whether the tile is on the seam's left, looking from its first corner to its last. A tile is on the left of
+    #: its southern and eastern seam, and on the right of its northern and western one
     left: bool
-    missing: bool = False
+    missing: bool = False  #: whether the tile on the other side is not there
 
 
 def label_beyond(seam: Seam, *, left: bool) -> NDArray[np.int32]:

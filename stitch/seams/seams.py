@@ -21,29 +21,16 @@ ON_WALL = 1e-6  # m; closer than that, a vertex of a strip is on the wall, but f
 
 @dataclass(frozen=True, eq=False)
 class Seam:
-    """Border of two tiles, or of one on the region's border.
+    """Border of two tiles, or of one on the region's border."""
 
-    Attributes
-    ----------
-    xy : float64, (k, 2)
-        Vertices (m) from the first corner to the last, east- or northwards.
-    wall_nodes : float64, (w, 2)
-        Those of them at which both tiles node a wall that has no vertex there.
-    border : bool
-        Whether it is a part of the region's border: then no other tile has its columns, but for the corners.
-    ring : PlaneMesh
-        The strip's triangles around its vertices; empty on the region's border.
-    vertex : int32, (k,)
-        The seam's vertices in `ring`; empty on the region's border.
-    surroundings : PlaneMesh
-        The strip's triangles as far around it as was asked, with those of `ring`; empty on the region's border.
-    """
-
-    xy: NDArray[np.float64]
+    xy: NDArray[np.float64]  #: (k, 2): vertices (m) from the first corner to the last, east- or northwards
+    #: (w, 2): those of them at which both tiles node a wall that has no vertex there
     wall_nodes: NDArray[np.float64]
+    #: whether it is a part of the region's border: then no other tile has its columns, but for the corners
     border: bool
-    ring: PlaneMesh
-    vertex: NDArray[np.int32]
+    ring: PlaneMesh  #: the strip's triangles around its vertices; empty on the region's border
+    vertex: NDArray[np.int32]  #: (k,): the seam's vertices in `ring`; empty on the region's border
+    #: the strip's triangles as far around it as was asked, with those of `ring`; empty on the region's border
     surroundings: PlaneMesh
 
 

@@ -31,22 +31,13 @@ DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])  # eas
 
 @dataclass(frozen=True, eq=False)
 class Corner:
-    """Where four tiles meet, or two and the region's border, or one and two of its sides.
+    """Where four tiles meet, or two and the region's border, or one and two of its sides."""
 
-    Attributes
-    ----------
-    xy : float64, (2,)
-        Place (m).
-    tips : float64, (4, 2)
-        Where the first edges of the seams eastwards, northwards, westwards and southwards end (m); NaN where
-        the region does.
-    building : int
-        Row of the building around it, -1 on open ground.
-    """
-
-    xy: NDArray[np.float64]
+    xy: NDArray[np.float64]  #: (2,): place (m)
+    #: (4, 2): where the first edges of the seams eastwards, northwards, westwards and southwards end (m); NaN
+    #: where the region does
     tips: NDArray[np.float64]
-    building: int
+    building: int  #: row of the building around it, -1 on open ground
 
 
 def place_corner(

@@ -37,32 +37,19 @@ class SeamKey(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TileGrid:
-    """Lines between tiles.
+    """Lines between tiles."""
 
-    Attributes
-    ----------
-    bounds : (xmin, ymin, xmax, ymax)
-        The region (m).
-    tile_size : float
-        Side of a tile (m).
-    first : Key
-        Indices of the first lines.
-    lines : two of float64, (nx + 1,) and (ny + 1,)
-        Ascending places of the lines (m): the region's sides, and between them multiples of the tile size,
-        line ``k`` of an axis at ``(first + k) * tile_size``. A line is left out that is closer than half a
-        tile to a side, so tiles are between half and one and a half of their size.
-    present : bool, (nx, ny), optional
-        Which tiles there are, by column and row; all where it is None. The region is made of these: towards a
-        tile that is absent it has a straight border.
-    open_size : float
-        Largest target edge length (m) where sizes are graded, 0 where they are the same everywhere.
-    """
-
-    bounds: Bounds
-    tile_size: float
-    first: Key
+    bounds: Bounds  #: (xmin, ymin, xmax, ymax): the region (m)
+    tile_size: float  #: side of a tile (m)
+    first: Key  #: indices of the first lines
+    #: ascending places of the lines (m): the region's sides, and between them multiples of the tile size, line
+    #: ``k`` of an axis at ``(first + k) * tile_size``. A line is left out that is closer than half a tile to a
+    #: side, so tiles are between half and one and a half of their size
     lines: tuple[NDArray[np.float64], NDArray[np.float64]]
+    #: which tiles there are, by column and row; all where it is None. The region is made of these: towards a tile
+    #: that is absent it has a straight border
     present: NDArray[np.bool_] | None = None
+    #: largest target edge length (m) where sizes are graded, 0 where they are the same everywhere
     open_size: float = 0.0
 
 

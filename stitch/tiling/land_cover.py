@@ -19,24 +19,13 @@ ON_EDGE = 1e-6  # m; closer than that, a vertex is on an edge, but for rounding
 
 @dataclass(frozen=True, eq=False)
 class LandCover:
-    """Polygons of land cover.
+    """Polygons of land cover."""
 
-    Attributes
-    ----------
-    polygons : object, (p,)
-        Valid polygons, which may overlap.
-    row : int64, (p,)
-        Patch of each, from 1: of several at a place the lowest counts; 0 is that of no polygon.
-    core : tuple of 4 floats, or None
-        The region without its pad (m), None without one.
-    pad : int
-        Patch of all that is outside of it.
-    """
-
-    polygons: NDArray[np.object_]
+    polygons: NDArray[np.object_]  #: (p,): valid polygons, which may overlap
+    #: (p,): patch of each, from 1: of several at a place the lowest counts; 0 is that of no polygon
     row: NDArray[np.int64]
-    core: Bounds | None = None
-    pad: int = 0
+    core: Bounds | None = None  #: the region without its pad (m), None without one
+    pad: int = 0  #: patch of all that is outside of it
 
 
 def find_patches(cover: LandCover, xy: NDArray[np.float64]) -> NDArray[np.int8]:

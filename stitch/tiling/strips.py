@@ -24,27 +24,14 @@ MARGIN = 0.5  # mesh sizes between the last piece of wall and the strip's sides
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """Triangles around the nominal line of a seam, with walls and the first edges of seams as edges.
+    """Triangles around the nominal line of a seam, with walls and the first edges of seams as edges."""
 
-    Attributes
-    ----------
-    xy : float64, (n, 2)
-        Vertices (m).
-    triangles : int32, (m, 3)
-        Vertex indices, counter-clockwise.
-    building : int32, (m,)
-        Row of the building that holds the triangle, -1 on open ground; true within the strip's core.
-    walls : float64, (w, 2, 2)
-        Pieces of wall, and further edges, that are edges of the strip (m).
-    edges : float64, (e, 2, 2)
-        The further ones (m).
-    """
-
-    xy: NDArray[np.float64]
-    triangles: NDArray[np.int32]
+    xy: NDArray[np.float64]  #: (n, 2): vertices (m)
+    triangles: NDArray[np.int32]  #: (m, 3): vertex indices, counter-clockwise
+    #: (m,): row of the building that holds the triangle, -1 on open ground; true within the strip's core
     building: NDArray[np.int32]
-    walls: NDArray[np.float64]
-    edges: NDArray[np.float64]
+    walls: NDArray[np.float64]  #: (w, 2, 2): pieces of wall, and further edges, that are edges of the strip (m)
+    edges: NDArray[np.float64]  #: (e, 2, 2): the further ones (m)
 
 
 def mesh_strip(

@@ -38,23 +38,12 @@ CITY_FILES = CITY_MODEL, FULL_CITY_MODEL
 
 @dataclass(frozen=True)
 class Outcome:
-    """An edit that is done.
+    """An edit that is done."""
 
-    Attributes
-    ----------
-    edit : Edit
-        As the journal has it.
-    record : dict
-        What ``run.json`` holds now.
-    files : int
-        Files of the folder that changed.
-    told : tuple of str
-        What to know of its uploads: roof points in the cloud that do not count, a foot off the ground.
-    """
-
-    edit: Edit
-    record: dict[str, Any]
-    files: int
+    edit: Edit  #: as the journal has it
+    record: dict[str, Any]  #: what ``run.json`` holds now
+    files: int  #: files of the folder that changed
+    #: what to know of its uploads: roof points in the cloud that do not count, a foot off the ground
     told: tuple[str, ...] = ()
 
 

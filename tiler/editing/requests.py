@@ -19,32 +19,15 @@ ACTIONS = ("replace", "remove", "add")
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """An edit as it is asked for.
+    """An edit as it is asked for."""
 
-    Attributes
-    ----------
-    action : str
-        One of `ACTIONS`.
-    building : str
-        Id of the building; ``""`` to add those of the upload.
-    upload : Uploaded or None
-        What comes.
-    source : str
-        Name of its file.
-    date : str
-        Day from which on it holds, YYYY-MM-DD; today by default.
-    base : int or None
-        Number of the last edit that the client knows of; by default of all.
-    request, digest : str
-        Name that a client gave it, and a hash of what it sent; empty without one.
-    """
-
-    action: str
-    building: str = ""
-    upload: Uploaded | None = None
-    source: str = ""
-    date: str = ""
-    base: int | None = None
+    action: str  #: one of `ACTIONS`
+    building: str = ""  #: id of the building; ``""`` to add those of the upload
+    upload: Uploaded | None = None  #: what comes
+    source: str = ""  #: name of its file
+    date: str = ""  #: day from which on it holds, YYYY-MM-DD; today by default
+    base: int | None = None  #: number of the last edit that the client knows of; by default of all
+    #: name that a client gave it, and a hash of what it sent; empty without one
     request: str = ""
     digest: str = ""
 

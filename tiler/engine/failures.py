@@ -13,53 +13,27 @@ KILLED_TRIES = 3  # a process that was killed may be nobody's fault: a node that
 
 @dataclass(frozen=True)
 class Policy:
-    """How failures are dealt with.
+    """How failures are dealt with."""
 
-    Attributes
-    ----------
-    retries : int
-        How often a task is tried again; not after errors that say what is wrong with the input.
-    set_aside : bool
-        Go on without the items that fail, and without what needs them; otherwise the first failure ends the run.
-    """
-
-    retries: int = 0
+    retries: int = 0  #: how often a task is tried again; not after errors that say what is wrong with the input
+    #: go on without the items that fail, and without what needs them; otherwise the first failure ends the run
     set_aside: bool = False
 
 
 @dataclass(frozen=True)
 class SetAside:
-    """An item that failed and was set aside.
+    """An item that failed and was set aside."""
 
-    Attributes
-    ----------
-    stage, name : str
-        The item.
-    scope : Scope
-        Scope of the stage.
-    kind : str
-        As of `tiler.engine.task.Failure`.
-    reason : str
-        The error's message.
-    trace : str
-        Where it arose.
-    attempts : int
-        How often it was tried.
-    inputs : dict of str to tuple of str
-        Items that it reads, by stage.
-    file : str
-        Path of its file, for the scope FILE; else empty.
-    """
-
+    #: the item
     stage: str
     name: str
-    scope: Scope
-    kind: str
-    reason: str
-    trace: str
-    attempts: int
-    inputs: dict[str, tuple[str, ...]]
-    file: str = ""
+    scope: Scope  #: scope of the stage
+    kind: str  #: as of `tiler.engine.task.Failure`
+    reason: str  #: the error's message
+    trace: str  #: where it arose
+    attempts: int  #: how often it was tried
+    inputs: dict[str, tuple[str, ...]]  #: items that it reads, by stage
+    file: str = ""  #: path of its file, for the scope FILE; else empty
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON values."""

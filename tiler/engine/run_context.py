@@ -29,28 +29,15 @@ AXES = "xy"  # first letter of a seam's name: along which axis it runs
 
 @dataclass(frozen=True)
 class RunContext:
-    """The region of a run: small, and the same for all tasks.
+    """The region of a run: small, and the same for all tasks."""
 
-    Attributes
-    ----------
-    bounds : (xmin, ymin, xmax, ymax)
-        The region (m).
-    crs : str
-        Its CRS as ``EPSG:NNNN`` where it has a code, else as WKT.
-    tile_size, mesh_size : float
-        Side of a tile and target edge length (m).
-    present : bytes
-        Which tiles there are, see `pack_tiles`.
-    open_size : float
-        Largest target edge length (m) where sizes are graded, else 0.
-    """
-
-    bounds: Bounds
-    crs: str
+    bounds: Bounds  #: (xmin, ymin, xmax, ymax): the region (m)
+    crs: str  #: its CRS as ``EPSG:NNNN`` where it has a code, else as WKT
+    #: side of a tile and target edge length (m)
     tile_size: float
     mesh_size: float
-    present: bytes
-    open_size: float = 0.0
+    present: bytes  #: which tiles there are, see `pack_tiles`
+    open_size: float = 0.0  #: largest target edge length (m) where sizes are graded, else 0
 
     @property
     def grid(self) -> TileGrid:

@@ -16,20 +16,11 @@ Item = tuple[str, str]  # stage and name
 
 @dataclass(eq=False)
 class Part:
-    """A task of a submission.
+    """A task of a submission."""
 
-    Attributes
-    ----------
-    function : callable
-        Function of its stage.
-    task : Task
-        The task; without its key where that is open.
-    key : OpenKey or None
-        What the key is made of, where the task reads a result of a part before it; None where the key is known.
-    """
-
-    function: Function
-    task: Task
+    function: Function  #: function of its stage
+    task: Task  #: the task; without its key where that is open
+    #: what the key is made of, where the task reads a result of a part before it; None where the key is known
     key: OpenKey | None = None
 
     def close(self, done: Mapping[Item, Record]) -> bool:

@@ -29,81 +29,42 @@ APART = ("key",)  # attributes of a result that are no content
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One result of a stage, as a reader gets it.
+    """One result of a stage, as a reader gets it."""
 
-    Attributes
-    ----------
-    name : str
-        Item that it belongs to.
-    arrays : dict of str to array
-        The arrays that were asked for.
-    facts : dict
-        What the stage's function gave back.
-    notes : tuple of Note
-        What it noted.
-    """
-
-    name: str
-    arrays: dict[str, NDArray[Any]]
-    facts: Facts
-    notes: tuple[Note, ...] = ()
+    name: str  #: item that it belongs to
+    arrays: dict[str, NDArray[Any]]  #: the arrays that were asked for
+    facts: Facts  #: what the stage's function gave back
+    notes: tuple[Note, ...] = ()  #: what it noted
 
 
 @dataclass(frozen=True)
 class Record:
-    """What the driver keeps of a result: small, no arrays.
+    """What the driver keeps of a result: small, no arrays."""
 
-    Attributes
-    ----------
-    stage, name, key : str
-        Which result, and the key of all that it depends on.
-    digest : str
-        Digest of its content: arrays, facts and notes.
-    facts : dict
-        What the stage's function gave back.
-    notes : dict of str to int
-        Number of notes by kind.
-    seconds : dict of str to float
-        Wall time by step (s), and ``"all"``; empty where an earlier result was taken.
-    peak_memory : int
-        Largest resident memory of the process so far (bytes).
-    reused : bool
-        True if an earlier result with the same key was taken.
-    damage : str
-        What was wrong with an earlier result that was there and computed again for that; else empty.
-    ago : float
-        How long the submission went on with its other tasks (s), before this record was given back.
-    """
-
+    #: which result, and the key of all that it depends on
     stage: str
     name: str
     key: str
-    digest: str
-    facts: Facts
-    notes: dict[str, int]
+    digest: str  #: digest of its content: arrays, facts and notes
+    facts: Facts  #: what the stage's function gave back
+    notes: dict[str, int]  #: number of notes by kind
+    #: wall time by step (s), and ``"all"``; empty where an earlier result was taken
     seconds: dict[str, float] = field(default_factory=dict)
-    peak_memory: int = 0
-    reused: bool = False
+    peak_memory: int = 0  #: largest resident memory of the process so far (bytes)
+    reused: bool = False  #: true if an earlier result with the same key was taken
+    #: what was wrong with an earlier result that was there and computed again for that; else empty
     damage: str = ""
+    #: how long the submission went on with its other tasks (s), before this record was given back
     ago: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Failure:
-    """An error that came back as a value: raised in a worker, Dask would print where in the code it arose.
+    """An error that came back as a value: raised in a worker, Dask would print where in the code it arose."""
 
-    Attributes
-    ----------
-    error : Exception
-        The error.
-    trace : str
-        Where in the code it arose, as text; empty where nobody knows.
-    kind : str
-        ``"error"``; or ``"memory"``, ``"time"``, ``"crash"`` or ``"killed"`` of a process that ended.
-    """
-
-    error: Exception
-    trace: str = ""
+    error: Exception  #: the error
+    trace: str = ""  #: where in the code it arose, as text; empty where nobody knows
+    #: ``"error"``; or ``"memory"``, ``"time"``, ``"crash"`` or ``"killed"`` of a process that ended
     kind: str = "error"
 
 
@@ -114,52 +75,25 @@ class Later:
 
 @dataclass(eq=False)
 class Task:
-    """One item of one stage: what its function reads through, and writes through.
+    """One item of one stage: what its function reads through, and writes through."""
 
-    Attributes
-    ----------
-    stage, name : str
-        Stage and item.
-    scope : Scope
-        Scope of the stage.
-    box : tuple of float
-        Box of the item (m).
-    parameters : Declared
-        The declared parameters as attributes.
-    context : object
-        What the engine was given, the same for all; not in the key, so it must follow from the layout and the
-        declared parameters.
-    file : str
-        Path of the file, for the scope FILE; else empty.
-    store : Store
-        The store.
-    refs : dict of str to tuple of str
-        Items to read by stage, sorted.
-    key : str
-        Key of all that the result depends on.
-    folder : Path
-        Where the files are that results state as the fact ``"files"``.
-    frame : Frame
-        How coordinates of the file become those of the region, for the scope FILE.
-    share : (int, int)
-        Which of the equal shares of the file's points it is for, and of how many.
-    former : str
-        Key that the same result has in a copied store, before changes that do not reach it; empty for none.
-    """
-
+    #: stage and item
     stage: str
     name: str
-    scope: Scope
-    box: Box
-    parameters: Any
+    scope: Scope  #: scope of the stage
+    box: Box  #: box of the item (m)
+    parameters: Any  #: the declared parameters as attributes
+    #: what the engine was given, the same for all; not in the key, so it must follow from the layout and the
+    #: declared parameters
     context: Any
-    file: str
-    store: Store
-    refs: dict[str, tuple[str, ...]]
-    key: str
-    folder: Path
-    frame: Frame = AS_IT_IS
-    share: Share = WHOLE
+    file: str  #: path of the file, for the scope FILE; else empty
+    store: Store  #: the store
+    refs: dict[str, tuple[str, ...]]  #: items to read by stage, sorted
+    key: str  #: key of all that the result depends on
+    folder: Path  #: where the files are that results state as the fact ``"files"``
+    frame: Frame = AS_IT_IS  #: how coordinates of the file become those of the region, for the scope FILE
+    share: Share = WHOLE  #: (int, int): which of the equal shares of the file's points it is for, and of how many
+    #: key that the same result has in a copied store, before changes that do not reach it; empty for none
     former: str = ""
     _writer: Writer | None = None
     _notes: list[Note] = field(default_factory=list)

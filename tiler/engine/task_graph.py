@@ -13,21 +13,11 @@ from tiler.engine.stage import Box, Layout, Read, Stage, check_box
 
 @dataclass(frozen=True, eq=False)
 class Refs:
-    """What the items of a stage read of one other stage.
+    """What the items of a stage read of one other stage."""
 
-    Attributes
-    ----------
-    stage : str
-        Stage that is read.
-    start : int64, (n_items + 1,)
-        Where the refs of each item begin in ``index``.
-    index : int32, (n_refs,)
-        Positions among the read stage's items, ascending for each reader.
-    """
-
-    stage: str
-    start: NDArray[np.int64]
-    index: NDArray[np.int32]
+    stage: str  #: stage that is read
+    start: NDArray[np.int64]  #: (n_items + 1,): where the refs of each item begin in ``index``
+    index: NDArray[np.int32]  #: (n_refs,): positions among the read stage's items, ascending for each reader
 
     def of(self, item: int) -> NDArray[np.int32]:
         """Give the positions that one item reads."""
@@ -36,18 +26,10 @@ class Refs:
 
 @dataclass(frozen=True, eq=False)
 class Items:
-    """The items of a stage, sorted by name.
+    """The items of a stage, sorted by name."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Their names.
-    boxes : float64, (n, 4)
-        Their boxes (m).
-    """
-
-    names: tuple[str, ...]
-    boxes: NDArray[np.float64]
+    names: tuple[str, ...]  #: their names
+    boxes: NDArray[np.float64]  #: (n, 4): their boxes (m)
 
 
 def order_stages(stages: Sequence[Stage], earlier: Collection[str]) -> list[Stage]:

@@ -41,18 +41,10 @@ class WorkerError(CityError):
 
 @dataclass(frozen=True)
 class Limits:
-    """What a task may take.
+    """What a task may take."""
 
-    Attributes
-    ----------
-    seconds : float
-        Wall time (s); 0 for no limit.
-    memory : int
-        Memory of a worker process (bytes); 0 for no limit.
-    """
-
-    seconds: float = 0.0
-    memory: int = 0
+    seconds: float = 0.0  #: wall time (s); 0 for no limit
+    memory: int = 0  #: memory of a worker process (bytes); 0 for no limit
 
 
 def trace_file(task: Task) -> Path:

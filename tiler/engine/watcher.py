@@ -11,40 +11,20 @@ from tiler.engine.task import Record
 
 @dataclass(frozen=True, eq=False)
 class RunStart:
-    """What is known when a run begins.
+    """What is known when a run begins."""
 
-    Attributes
-    ----------
-    out : Path
-        Folder of the run.
-    command : str
-        What a user gives to run it again or to go on; empty where no command does it.
-    bounds : (xmin, ymin, xmax, ymax)
-        The region (m).
-    crs : str
-        Its CRS.
-    tile_size : float
-        Side of a tile (m).
-    workers : int
-        Number of workers, 0 where a cluster decides.
-    tiles, seams : mapping of str to (xmin, ymin, xmax, ymax)
-        Their boxes by name (m).
-    expected : mapping of str to (Scope, int)
-        Scope and number of items of the stages that are known from the start, in their order.
-    whole : frozenset of str
-        Stages that only the whole run has: ``--only`` leaves them out.
-    """
-
-    out: Path
-    command: str
-    bounds: Box
-    crs: str
-    tile_size: float
-    workers: int
+    out: Path  #: folder of the run
+    command: str  #: what a user gives to run it again or to go on; empty where no command does it
+    bounds: Box  #: (xmin, ymin, xmax, ymax): the region (m)
+    crs: str  #: its CRS
+    tile_size: float  #: side of a tile (m)
+    workers: int  #: number of workers, 0 where a cluster decides
+    #: their boxes by name (m)
     tiles: Mapping[str, Box]
     seams: Mapping[str, Box]
+    #: scope and number of items of the stages that are known from the start, in their order
     expected: Mapping[str, tuple[Scope, int]]
-    whole: frozenset[str] = frozenset()
+    whole: frozenset[str] = frozenset()  #: stages that only the whole run has: ``--only`` leaves them out
 
 
 class Watcher:

@@ -25,21 +25,11 @@ PAGE = 'see "TLS" in docs/cluster.md'
 
 @dataclass(frozen=True)
 class TlsFiles:
-    """Files of TLS, PEM; where one is empty, Dask's own configuration counts.
+    """Files of TLS, PEM; where one is empty, Dask's own configuration counts."""
 
-    Attributes
-    ----------
-    tls_ca : str
-        Certificate of the authority that has signed those of scheduler and workers.
-    tls_cert : str
-        Certificate of this client.
-    tls_key : str
-        Its key, without a passphrase; may lie in the file of the certificate.
-    """
-
-    tls_ca: str = ""
-    tls_cert: str = ""
-    tls_key: str = ""
+    tls_ca: str = ""  #: certificate of the authority that has signed those of scheduler and workers
+    tls_cert: str = ""  #: certificate of this client
+    tls_key: str = ""  #: its key, without a passphrase; may lie in the file of the certificate
 
 
 NO_FILES = TlsFiles()

@@ -54,40 +54,20 @@ class ClusterMismatchError(ConfigError):
 
 @dataclass(frozen=True)
 class Requirements:
-    """What a worker must meet; sent with every task.
+    """What a worker must meet; sent with every task."""
 
-    Attributes
-    ----------
-    versions : str
-        `digest_versions` of the driver.
-    probe : str
-        Path of a file of the driver in the output folder, which lists inputs too; empty for none.
-    token : str
-        Hash of the bytes of that file.
-    """
-
-    versions: str
-    probe: str = ""
-    token: str = ""
+    versions: str  #: `digest_versions` of the driver
+    probe: str = ""  #: path of a file of the driver in the output folder, which lists inputs too; empty for none
+    token: str = ""  #: hash of the bytes of that file
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Result of a task on a worker that does not meet the requirements.
+    """Result of a task on a worker that does not meet the requirements."""
 
-    Attributes
-    ----------
-    worker : str
-        Its address.
-    versions : dict of str to str
-        Its versions.
-    files : dict of str to str
-        What is wrong with files, by path.
-    """
-
-    worker: str
-    versions: Versions
-    files: Files
+    worker: str  #: its address
+    versions: Versions  #: its versions
+    files: Files  #: what is wrong with files, by path
 
     def as_error(self, address: str) -> ClusterMismatchError:
         """Error of a run on the scheduler of that address."""

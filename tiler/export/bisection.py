@@ -19,25 +19,14 @@ CHUNK = 1 << 18  # columns that are looked at together
 
 @dataclass(frozen=True, eq=False)
 class Cuts:
-    """A tree of cuts in plan; node 0 is the whole region.
+    """A tree of cuts in plan; node 0 is the whole region."""
 
-    Attributes
-    ----------
-    axis : int64, (n,)
-        0 for a cut across x, 1 across y.
-    place : float64, (n,)
-        A column goes low where ``along + TILT * across`` is less (m).
-    low, high : int64, (n,)
-        The next node on each side; -1 less the part where there is no further cut.
-    n_parts : int
-        Number of parts.
-    """
-
-    axis: Ints
-    place: Floats
+    axis: Ints  #: (n,): 0 for a cut across x, 1 across y
+    place: Floats  #: (n,): a column goes low where ``along + TILT * across`` is less (m)
+    #: (n,): the next node on each side; -1 less the part where there is no further cut
     low: Ints
     high: Ints
-    n_parts: int
+    n_parts: int  #: number of parts
 
     def part_of(self, centre: Floats) -> Ints:
         """Return the part of each column, (k, 2) to (k,), by the middle of its box in plan (m)."""

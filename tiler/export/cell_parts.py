@@ -32,30 +32,19 @@ Ids = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class CellParts:
-    """The parts of a region's cells.
+    """The parts of a region's cells."""
 
-    Attributes
-    ----------
-    part : int32, (cells,)
-        Part of each cell, by its number over the region; a file. None where there is one part, the whole mesh.
-    place : int64, (cells,)
-        Its number within the part, ascending with its number over the region; a file. None as before.
-    n_cells, n_inner : int64, (p,)
-        Cells of each part, and faces between two of them.
-    between : Counter of (int, int)
-        Faces between two parts, the lower first.
-    pieces : sequence of sequence of int
-        The pieces that have cells of each part, ascending.
-    sets : sequence of sequence of FacetSets
-        For each kind of sets, its facets within each part; the last is of cells.
-    """
-
+    #: (cells,): part of each cell, by its number over the region; a file. None where there is one part, the whole
+    #: mesh
     part: Ids | None
+    #: (cells,): its number within the part, ascending with its number over the region; a file. None as before
     place: Ints | None
+    #: (p,): cells of each part, and faces between two of them
     n_cells: Ints
     n_inner: Ints
-    between: Counter[tuple[int, int]]
-    pieces: Sequence[Sequence[int]]
+    between: Counter[tuple[int, int]]  #: faces between two parts, the lower first
+    pieces: Sequence[Sequence[int]]  #: the pieces that have cells of each part, ascending
+    #: for each kind of sets, its facets within each part; the last is of cells
     sets: Sequence[Sequence[FacetSets]]
 
     def part_of(self, cell: Ints) -> Ids:

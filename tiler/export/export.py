@@ -35,34 +35,17 @@ PER_BUILDING = ("buildings", LARGEST_PART, ORIGIN)
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file to export.
+    """A kind of file to export."""
 
-    Attributes
-    ----------
-    description : str
-        What it holds, in a few words.
-    write : callable
-        Given a path and the files of a run, and the options as keywords, writes that file or folder. It may return
-        what must be known of it, a list of str.
-    options : tuple of str
-        Options of the command line that it takes, without dashes.
-    buildings : tuple of str
-        What the option ``buildings`` may be, where it is taken.
-    folder : bool
-        Whether it is a folder.
-    suffix : str
-        What the name of the file must end with, if anything.
-    companion : str
-        Suffix of a second file beside it, if there is one.
-    """
-
-    description: str
+    description: str  #: what it holds, in a few words
+    #: given a path and the files of a run, and the options as keywords, writes that file or folder. It may return
+    #: what must be known of it, a list of str
     write: Callable[..., list[str] | None]
-    options: tuple[str, ...] = ()
-    buildings: tuple[str, ...] = ("patches",)
-    folder: bool = False
-    suffix: str = ""
-    companion: str = ""
+    options: tuple[str, ...] = ()  #: options of the command line that it takes, without dashes
+    buildings: tuple[str, ...] = ("patches",)  #: what the option ``buildings`` may be, where it is taken
+    folder: bool = False  #: whether it is a folder
+    suffix: str = ""  #: what the name of the file must end with, if anything
+    companion: str = ""  #: suffix of a second file beside it, if there is one
 
 
 def list_formats() -> tuple[str, ...]:

@@ -61,76 +61,44 @@ def leaves_beside(heights: Path) -> Path:
 
 @dataclass(frozen=True)
 class PartCounts:
-    """What was written of a mesh, or of one part of it.
+    """What was written of a mesh, or of one part of it."""
 
-    Attributes
-    ----------
-    cells, points, faces, inner_faces : int
-        Their numbers.
-    patches : mapping of str to int
-        Faces of each patch, processor patches included.
-    lowest, highest : mapping of str to float
-        Lowest and highest point (m) of each patch of the region's boundary that has faces here.
-    near : mapping of str to int64 (len(DISTANCES) + 1,)
-        Of each patch that is a wall, for how many faces the centre of their cell is within `DISTANCES` of their
-        plane.
-    leaves : mapping of str to int
-        Cells of each zone of cells between leaves.
-    """
-
+    #: their numbers
     cells: int
     points: int
     faces: int
     inner_faces: int
-    patches: Mapping[str, int]
+    patches: Mapping[str, int]  #: faces of each patch, processor patches included
+    #: lowest and highest point (m) of each patch of the region's boundary that has faces here
     lowest: Mapping[str, float]
     highest: Mapping[str, float]
+    #: of each patch that is a wall, for how many faces the centre of their cell is within `DISTANCES` of their
+    #: plane
     near: Mapping[str, Ints]
-    leaves: Mapping[str, int] = field(default_factory=dict)
+    leaves: Mapping[str, int] = field(default_factory=dict)  #: cells of each zone of cells between leaves
 
 
 @dataclass(frozen=True, eq=False)
 class FoamPlan:
-    """What all parts are written from.
+    """What all parts are written from."""
 
-    Attributes
-    ----------
-    pieces : Pieces
-        The mesh.
-    region : RegionFaces
-        Numbers of cells and faces.
-    patches, volumes : FacetSets
-        Patches by key (`patch_of_key`) and cell zones by region, of the whole mesh. `parts` has those of each
-        part, in this order: patches, face zones by key (`face_zone_name`), cell zones.
-    zoned : bool
-        Whether face zones are written.
-    patch_keys, zone_keys : callable
-        Give the key of each facet of a piece, -1 for none.
-    parts : CellParts
-        Part of each cell.
-    label : int
-        Bits of an integer.
-    volume_keys : callable
-        Gives the key of each cell of a piece, or none at all.
-    heights : Path, optional
-        A folder for the heights of the centres of cells (m), float64: a file for each part by its number, and for
-        two parts ``a`` and ``b`` that meet a file ``a-b`` of the cells of ``a`` at their faces, in their order.
-    polygons : bool
-        Whether faces may have four corners.
-    """
-
-    pieces: Pieces
-    region: RegionFaces
+    pieces: Pieces  #: the mesh
+    region: RegionFaces  #: numbers of cells and faces
+    #: patches by key (`patch_of_key`) and cell zones by region, of the whole mesh. `parts` has those of each part,
+    #: in this order: patches, face zones by key (`face_zone_name`), cell zones
     patches: FacetSets
     volumes: FacetSets
-    zoned: bool
+    zoned: bool  #: whether face zones are written
+    #: give the key of each facet of a piece, -1 for none
     patch_keys: Callable[[MeshPiece], Ints]
     zone_keys: Callable[[MeshPiece], Ints]
-    parts: CellParts
-    label: int
+    parts: CellParts  #: part of each cell
+    label: int  #: bits of an integer
+    #: a folder for the heights of the centres of cells (m), float64: a file for each part by its number, and for
+    #: two parts ``a`` and ``b`` that meet a file ``a-b`` of the cells of ``a`` at their faces, in their order
     heights: Path | None = None
-    volume_keys: Callable[[MeshPiece], Ints] = no_keys
-    polygons: bool = False
+    volume_keys: Callable[[MeshPiece], Ints] = no_keys  #: gives the key of each cell of a piece, or none at all
+    polygons: bool = False  #: whether faces may have four corners
 
 
 class PointPlaces:

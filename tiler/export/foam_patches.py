@@ -39,19 +39,12 @@ WIDTH = 20  # characters of a face's number in a zone, its line break among them
 
 @dataclass(frozen=True)
 class Patch:
-    """A patch of the region's boundary.
+    """A patch of the region's boundary."""
 
-    Attributes
-    ----------
-    name, kind : str
-        Its name and type.
-    groups : tuple of str
-        Names under which boundary conditions can take it together with others.
-    """
-
+    #: its name and type
     name: str
     kind: str
-    groups: tuple[str, ...]
+    groups: tuple[str, ...]  #: names under which boundary conditions can take it together with others
 
 
 def patch_of_key(key: int, ground: Sequence[str] = ()) -> Patch:

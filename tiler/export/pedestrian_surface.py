@@ -13,18 +13,10 @@ from tiler.mesh_files.run_files import RunSource
 
 @dataclass(frozen=True, eq=False)
 class LiftedGround:
-    """The ground of a boundary, lifted: see `tiler.export.surface.Surface`.
+    """The ground of a boundary, lifted: see `tiler.export.surface.Surface`."""
 
-    Attributes
-    ----------
-    surface : Surface
-        The boundary.
-    height : float
-        How far it is lifted (m).
-    """
-
-    surface: Surface
-    height: float
+    surface: Surface  #: the boundary
+    height: float  #: how far it is lifted (m)
 
     @property
     def names(self) -> tuple[str, ...]:

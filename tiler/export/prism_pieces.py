@@ -18,27 +18,13 @@ from tiler.mesh_files.transitions import NO_CORNER, find_cut_sides, find_seam_si
 
 @dataclass(frozen=True, eq=False)
 class PrismPieces:
-    """The pieces of a run as prisms and tetrahedra.
+    """The pieces of a run as prisms and tetrahedra."""
 
-    Attributes
-    ----------
-    source : MeshPieces
-        The tetrahedra.
-    kind : {"prism", "hybrid"}
-        See `tiler.mesh_files.prisms.read_prisms`.
-    layers : int
-        Of a hybrid mesh.
-    cut : Path
-        Of a hybrid mesh, the file of which sides of cells are two triangles, bool (m, 3).
-    start : list of int
-        Where each piece begins in it.
-    """
-
-    source: MeshPieces
-    kind: str
-    layers: int
-    cut: Path
-    start: list[int]
+    source: MeshPieces  #: the tetrahedra
+    kind: str  #: see `tiler.mesh_files.prisms.read_prisms`
+    layers: int  #: of a hybrid mesh
+    cut: Path  #: of a hybrid mesh, the file of which sides of cells are two triangles, bool (m, 3)
+    start: list[int]  #: where each piece begins in it
 
     @property
     def names(self) -> tuple[str, ...]:

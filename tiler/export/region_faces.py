@@ -35,17 +35,10 @@ BLOCK_CELLS = 2**17  # whose faces are put in order together
 
 @dataclass(frozen=True, eq=False)
 class FacetSets:
-    """Sets of facets, patches say, and how many facets of each every piece has.
+    """Sets of facets, patches say, and how many facets of each every piece has."""
 
-    Attributes
-    ----------
-    keys : int64, (p,)
-        Keys of the sets, ascending.
-    counts : mapping of int to dict of int to int
-        For each piece that has any, how many of its facets a set has, by row in `keys`.
-    """
-
-    keys: Ints
+    keys: Ints  #: (p,): keys of the sets, ascending
+    #: for each piece that has any, how many of its facets a set has, by row in `keys`
     counts: Mapping[int, dict[int, int]]
 
     def first(self, pieces: Sequence[int]) -> tuple[dict[int, dict[int, int]], Ints]:
@@ -69,32 +62,17 @@ class FacetSets:
 
 @dataclass(frozen=True, eq=False)
 class RegionFaces:
-    """How the faces of a region are numbered: ``k`` pieces, ``s`` faces shared by two of them, each twice.
+    """How the faces of a region are numbered: ``k`` pieces, ``s`` faces shared by two of them, each twice."""
 
-    Attributes
-    ----------
-    cell_start, face_start, shared_start : int64, (k + 1,)
-        Where the cells, the faces and the shared faces of each piece begin. The last is their number.
-    cell : int64, (s,)
-        Cell of each shared face, in the order of `CellFaces.shared`, piece by piece; a file.
-    mate : int64, (s,)
-        The same face as the other piece has it, as a row of these arrays; a file.
-    face : int64, (s,)
-        Its number among the faces of the region; a file.
-    centre : float64, (k, 2)
-        Middle of each piece's box (m).
-    between : Counter of (int, int)
-        Number of faces that two pieces share, by their numbers, the lower first.
-    """
-
+    #: (k + 1,): where the cells, the faces and the shared faces of each piece begin. The last is their number
     cell_start: Ints
     face_start: Ints
     shared_start: Ints
-    cell: Ints
-    mate: Ints
-    face: Ints
-    centre: NDArray[np.float64]
-    between: Counter[tuple[int, int]]
+    cell: Ints  #: (s,): cell of each shared face, in the order of `CellFaces.shared`, piece by piece; a file
+    mate: Ints  #: (s,): the same face as the other piece has it, as a row of these arrays; a file
+    face: Ints  #: (s,): its number among the faces of the region; a file
+    centre: NDArray[np.float64]  #: (k, 2): middle of each piece's box (m)
+    between: Counter[tuple[int, int]]  #: number of faces that two pieces share, by their numbers, the lower first
 
     @property
     def n_inner(self) -> int:
@@ -104,23 +82,15 @@ class RegionFaces:
 
 @dataclass(frozen=True, eq=False)
 class OwnFaces:
-    """Faces with two cells, whose lower cell is in a piece: some of its, in the region's order.
+    """Faces with two cells, whose lower cell is in a piece: some of its, in the region's order."""
 
-    Attributes
-    ----------
-    owner, neighbour : int64, (n,)
-        Cells by their numbers over the region, ascending pairs.
-    corners : int32, (n, 3) or (n, 4)
-        Vertices as rows of the piece's points, that of the lowest number over the region first; the normal points
-        out of the owner.
-    number : int64, (n,)
-        Number of each among the faces of the region.
-    """
-
+    #: (n,): cells by their numbers over the region, ascending pairs
     owner: Ints
     neighbour: Ints
+    #: (n, 3) or (n, 4): vertices as rows of the piece's points, that of the lowest number over the region first;
+    #: the normal points out of the owner
     corners: NDArray[np.int32]
-    number: Ints
+    number: Ints  #: (n,): number of each among the faces of the region
 
 
 @dataclass(frozen=True, eq=False)

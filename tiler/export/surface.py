@@ -176,23 +176,12 @@ class VertexSet:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSurvey:
-    """What is known after reading a boundary once.
+    """What is known after reading a boundary once."""
 
-    Attributes
-    ----------
-    vertices : VertexSet
-        Places of its vertices.
-    n_vertices : int
-        How many there are.
-    facets : dict of int to int
-        Facets by key, ascending; keys without facets are not there.
-    low, high : float64, (3,)
-        Box of its vertices (m); infinite where there is none.
-    """
-
-    vertices: VertexSet
-    n_vertices: int
-    facets: dict[int, int]
+    vertices: VertexSet  #: places of its vertices
+    n_vertices: int  #: how many there are
+    facets: dict[int, int]  #: facets by key, ascending; keys without facets are not there
+    #: (3,): box of its vertices (m); infinite where there is none
     low: NDArray[np.float64]
     high: NDArray[np.float64]
 

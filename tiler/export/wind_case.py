@@ -120,26 +120,16 @@ done
 
 @dataclass(frozen=True)
 class Domain:
-    """What a wind case must know of the mesh.
+    """What a wind case must know of the mesh."""
 
-    Attributes
-    ----------
-    patches : mapping of str to int
-        Faces of each patch of the region's boundary.
-    lowest, highest : mapping of str to float
-        Lowest and highest point of each (m).
-    heights : sequence of Path
-        For each part a file of the heights of the centres of its cells (m), float64; beside them those of cells at
-        faces between two parts, see `tiler.export.foam_part.FoamPlan`.
-    leaves : sequence of str
-        Zones of cells between leaves.
-    """
-
-    patches: Mapping[str, int]
+    patches: Mapping[str, int]  #: faces of each patch of the region's boundary
+    #: lowest and highest point of each (m)
     lowest: Mapping[str, float]
     highest: Mapping[str, float]
+    #: for each part a file of the heights of the centres of its cells (m), float64; beside them those of cells at
+    #: faces between two parts, see `tiler.export.foam_part.FoamPlan`
     heights: Sequence[Path]
-    leaves: Sequence[str] = ()
+    leaves: Sequence[str] = ()  #: zones of cells between leaves
 
     @property
     def flat_top(self) -> bool:

@@ -36,47 +36,26 @@ class WindWords(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class WindTable:
-    """The wind at some heights; between them it is linear, beyond the first and last it stays.
+    """The wind at some heights; between them it is linear, beyond the first and last it stays."""
 
-    Attributes
-    ----------
-    height : tuple of float
-        Heights above the inlet's lowest ground (m), ascending.
-    speed : tuple of float
-        Speeds (m/s).
-    k, epsilon : tuple of float
-        Turbulent kinetic energy (m2/s2) and its dissipation (m2/s3); empty where the file has none.
-    """
-
-    height: tuple[float, ...]
-    speed: tuple[float, ...]
+    height: tuple[float, ...]  #: heights above the inlet's lowest ground (m), ascending
+    speed: tuple[float, ...]  #: speeds (m/s)
+    #: turbulent kinetic energy (m2/s2) and its dissipation (m2/s3); empty where the file has none
     k: tuple[float, ...] = ()
     epsilon: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Wind:
-    """The wind at the inlet.
+    """The wind at the inlet."""
 
-    Attributes
-    ----------
-    directions : tuple of float
-        Where it comes from: degrees clockwise from north of the CRS.
-    speed, height : float
-        Speed (m/s) at a height above the inlet's lowest ground (m).
-    roughness : float
-        Roughness length upstream, and of the ground (m).
-    patches : mapping of str to float
-        Roughness lengths of patches that differ (m).
-    table : WindTable, optional
-        The profile, instead of the logarithmic one; `speed` is then that of the table at `height`.
-    """
-
-    directions: tuple[float, ...] = (WEST,)
+    directions: tuple[float, ...] = (WEST,)  #: where it comes from: degrees clockwise from north of the CRS
+    #: speed (m/s) at a height above the inlet's lowest ground (m)
     speed: float = 5.0
     height: float = 10.0
-    roughness: float = 0.5
-    patches: Mapping[str, float] = field(default_factory=dict)
+    roughness: float = 0.5  #: roughness length upstream, and of the ground (m)
+    patches: Mapping[str, float] = field(default_factory=dict)  #: roughness lengths of patches that differ (m)
+    #: the profile, instead of the logarithmic one; `speed` is then that of the table at `height`
     table: WindTable | None = None
 
     @property

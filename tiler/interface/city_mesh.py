@@ -37,15 +37,9 @@ NO_BUILDING = -1
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture; a notebook shows it.
+    """A picture; a notebook shows it."""
 
-    Attributes
-    ----------
-    png : bytes
-        The PNG file.
-    """
-
-    png: bytes
+    png: bytes  #: the PNG file
 
     def __repr__(self) -> str:
         return f"<Picture, PNG of {len(self.png):,} bytes>"
@@ -62,15 +56,9 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class VectorPicture:
-    """A map; a notebook shows it.
+    """A map; a notebook shows it."""
 
-    Attributes
-    ----------
-    svg : str
-        The SVG file.
-    """
-
-    svg: str
+    svg: str  #: the SVG file
 
     def __repr__(self) -> str:
         return f"<VectorPicture, SVG of {len(self.svg):,} bytes>"
@@ -87,28 +75,17 @@ class VectorPicture:
 
 @dataclass(frozen=True, eq=False)
 class Building:
-    """A building of the simplified city model, or a part of one.
+    """A building of the simplified city model, or a part of one."""
 
-    Attributes
-    ----------
-    id, house : str
-        Its id, and that of the house: the same where it has no parts.
-    number : int
-        What `MeshPiece.building` refers to.
-    ground, roof : float
-        Absolute heights (m).
-    footprint : shapely.Polygon or shapely.MultiPolygon
-        Outline as it was meshed (m).
-    attributes : mapping
-        All attributes of the city model: where the height is from, number of roof points, what was changed.
-    """
-
+    #: its id, and that of the house: the same where it has no parts
     id: str
     house: str
-    number: int
+    number: int  #: what `MeshPiece.building` refers to
+    #: absolute heights (m)
     ground: float
     roof: float
-    footprint: Any
+    footprint: Any  #: outline as it was meshed (m)
+    #: all attributes of the city model: where the height is from, number of roof points, what was changed
     attributes: Mapping[str, Any]
 
 

@@ -12,21 +12,12 @@ from tiler.interface.city_mesh import VectorPicture
 
 @dataclass(frozen=True, eq=False)
 class RunPlan:
-    """What a run would do and take; a notebook shows the text.
+    """What a run would do and take; a notebook shows the text."""
 
-    Attributes
-    ----------
-    config : Config
-        Parameters of the run.
-    facts : dict
-        The plan as `citystitch plan --json` writes it: region, tiles, files, tasks, cells, memory, seconds.
-    text : str
-        The same as text.
-    """
-
-    config: Config
+    config: Config  #: parameters of the run
+    #: the plan as `citystitch plan --json` writes it: region, tiles, files, tasks, cells, memory, seconds
     facts: dict[str, Any]
-    text: str
+    text: str  #: the same as text
 
     def __repr__(self) -> str:
         return self.text.rstrip("\n")

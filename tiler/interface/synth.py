@@ -30,26 +30,18 @@ _TAGS = {"shed": "skillion", "gable": "gabled", "hip": "hipped", "pyramid": "pyr
 
 @dataclass(frozen=True)
 class SynthFiles:
-    """What `write_city` wrote.
+    """What `write_city` wrote."""
 
-    Attributes
-    ----------
-    clouds : list of Path
-        LAZ files, sorted.
-    footprints, shapefile : Path
-        The same footprints as GPKG and SHP, with the attribute ``id``. With mixed roofs the GPKG has besides, in
-        the words of OpenStreetMap, ``height`` (m, from the ground to the ridge), ``roof:shape``, ``roof:height``,
-        ``roof:direction`` and ``roof:orientation``.
-    truth : Path
-        JSON with the parameters, and the ground and the highest place of the roof of each building (m); with mixed
-        roofs also its type, its eaves, and its planes: over each of the ``wings``, whose corners are ``ring``, the
-        roof is the lowest of ``a (x - x0) + b (y - y0) + c``, where ``origin`` is ``x0, y0`` and each of
-        ``planes`` is ``a, b, c``; where two wings overlap, the higher of both.
-    """
-
-    clouds: list[Path]
+    clouds: list[Path]  #: LAZ files, sorted
+    #: the same footprints as GPKG and SHP, with the attribute ``id``. With mixed roofs the GPKG has besides, in
+    #: the words of OpenStreetMap, ``height`` (m, from the ground to the ridge), ``roof:shape``, ``roof:height``,
+    #: ``roof:direction`` and ``roof:orientation``
     footprints: Path
     shapefile: Path
+    #: JSON with the parameters, and the ground and the highest place of the roof of each building (m); with mixed
+    #: roofs also its type, its eaves, and its planes: over each of the ``wings``, whose corners are ``ring``, the
+    #: roof is the lowest of ``a (x - x0) + b (y - y0) + c``, where ``origin`` is ``x0, y0`` and each of ``planes``
+    #: is ``a, b, c``; where two wings overlap, the higher of both
     truth: Path
 
 

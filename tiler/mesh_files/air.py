@@ -14,15 +14,9 @@ from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces
 
 @dataclass(frozen=True, eq=False)
 class AirPieces(MeshPieces):
-    """The air of the pieces of a run, its points numbered from 0 on.
+    """The air of the pieces of a run, its points numbered from 0 on."""
 
-    Attributes
-    ----------
-    whole : MeshPieces
-        All regions.
-    """
-
-    whole: MeshPieces
+    whole: MeshPieces  #: all regions
 
     def read(self, k: int) -> MeshPiece:
         """Read the air of piece `k`; ground, walls and roofs bound it."""

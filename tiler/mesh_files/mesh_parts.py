@@ -21,24 +21,13 @@ LISTED_PARTS = 20  # that the record lists, largest first
 
 @dataclass(frozen=True, eq=False)
 class TileParts:
-    """Parts of one tile's air.
+    """Parts of one tile's air."""
 
-    Attributes
-    ----------
-    name : str
-        The tile.
-    cells : sequence of int
-        Cells of each part.
-    seams : mapping of str to number of faces
-        Seams that it shares with a tile that is there.
-    edges : mapping of str to list of (edge, part)
-        Of a tile of several parts: by seam, the plan edges over which it shares faces, x and y of both ends (m),
-        the lesser one first, and the part that each belongs to.
-    """
-
-    name: str
-    cells: Sequence[int]
-    seams: Mapping[str, int]
+    name: str  #: the tile
+    cells: Sequence[int]  #: cells of each part
+    seams: Mapping[str, int]  #: seams that it shares with a tile that is there
+    #: of a tile of several parts: by seam, the plan edges over which it shares faces, x and y of both ends (m),
+    #: the lesser one first, and the part that each belongs to
     edges: Mapping[str, Sequence[tuple[tuple[float, ...], int]]] = field(default_factory=dict)
 
 

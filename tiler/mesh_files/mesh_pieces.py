@@ -24,69 +24,39 @@ SIDE = 1e-6  # m; how far from a side of the region a facet on it may be
 
 @dataclass(frozen=True, eq=False)
 class MeshPiece:
-    """The part of the mesh that one tile holds: ``n`` points, ``m`` cells, ``f`` facets.
+    """The part of the mesh that one tile holds: ``n`` points, ``m`` cells, ``f`` facets."""
 
-    Attributes
-    ----------
-    name : str
-        The tile, ``"60_-3"``: its column and row in the CRS.
-    points : float64, (n, 3)
-        Points that its cells use (m), from the origin of `RunFiles` on.
-    cells : int32, (m, 4)
-        Tetrahedra of positive volume, as rows of `points`.
-    facets : int32, (f, 3)
-        Facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces that it
-        shares with another tile are not among them. Ground above soil, and walls and roofs of
-        buildings with cells, are there although they are inside.
-    marker : int32, (f,)
-        `pipeline.data.mesh.Marker` of each facet; with land cover, `GROUND_PATCHES` and the number of its patch on
-        ground that has one.
-    building : int64, (f,)
-        Number of each facet's building, -1 where there is none.
-    ids : int64, (n,)
-        Number of each point over the whole region, 0 to ``n_points - 1`` of `MeshPieces`. A point that several
-        tiles have is bitwise the same in all of them, and has one number.
-    region : int8, (m,), or None
-        `pipeline.data.mesh.Region` of each cell; None where all is air.
-    leaves : float32, (m,), or None
-        Leaf area density of each cell (m2/m3), 0 in open air; None in a run without trees.
-    regions : tuple of Region
-        What cells of the whole mesh are filled with.
-    faces : CellFaces, or None
-        Faces of cells that are no tetrahedra (`tiler.export.prism_pieces`): then rows of `cells` have six places,
-        those of faces and `facets` four, with `tiler.mesh_files.transitions.NO_CORNER` in those that are left.
-    """
-
-    name: str
-    points: NDArray[np.float64]
-    cells: NDArray[np.int32]
+    name: str  #: the tile, ``"60_-3"``: its column and row in the CRS
+    points: NDArray[np.float64]  #: (n, 3): points that its cells use (m), from the origin of `RunFiles` on
+    cells: NDArray[np.int32]  #: (m, 4): tetrahedra of positive volume, as rows of `points`
+    #: (f, 3): facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces
+    #: that it shares with another tile are not among them. Ground above soil, and walls and roofs of buildings
+    #: with cells, are there although they are inside
     facets: NDArray[np.int32]
+    #: (f,): `pipeline.data.mesh.Marker` of each facet; with land cover, `GROUND_PATCHES` and the number of its
+    #: patch on ground that has one
     marker: NDArray[np.int32]
-    building: NDArray[np.int64]
+    building: NDArray[np.int64]  #: (f,): number of each facet's building, -1 where there is none
+    #: (n,): number of each point over the whole region, 0 to ``n_points - 1`` of `MeshPieces`. A point that
+    #: several tiles have is bitwise the same in all of them, and has one number
     ids: NDArray[np.int64]
+    #: (m,): `pipeline.data.mesh.Region` of each cell; None where all is air
     region: NDArray[np.int8] | None = None
+    #: (m,): leaf area density of each cell (m2/m3), 0 in open air; None in a run without trees
     leaves: NDArray[np.float32] | None = None
-    regions: Regions = (Region.AIR,)
+    regions: Regions = (Region.AIR,)  #: what cells of the whole mesh are filled with
+    #: faces of cells that are no tetrahedra (`tiler.export.prism_pieces`): then rows of `cells` have six places,
+    #: those of faces and `facets` four, with `tiler.mesh_files.transitions.NO_CORNER` in those that are left
     faces: CellFaces | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class MeshPieces:
-    """The pieces of a finished run.
+    """The pieces of a finished run."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Its tiles, sorted.
-    files : RunFiles
-        The files that hold them, in the same order.
-    numbering : Numbering
-        From the ids in the pieces to numbers without gaps.
-    """
-
-    names: tuple[str, ...]
-    files: RunFiles
-    numbering: Numbering
+    names: tuple[str, ...]  #: its tiles, sorted
+    files: RunFiles  #: the files that hold them, in the same order
+    numbering: Numbering  #: from the ids in the pieces to numbers without gaps
 
     @property
     def n_points(self) -> int:

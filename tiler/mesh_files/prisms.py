@@ -34,57 +34,34 @@ FACES_OF = {
 
 @dataclass(frozen=True, eq=False)
 class PrismMesh:
-    """The mesh of a run as ``m`` prisms and other cells on ``n`` points, and its faces; all of it is in memory.
+    """The mesh of a run as ``m`` prisms and other cells on ``n`` points, and its faces; all of it is in memory."""
 
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Points (m), by their numbers over the region; then the middles of prisms that are cut.
-    cells : int64, (m, 6)
-        Prism: a triangle, counter-clockwise seen from above, and the corners over it. Pyramid: a quadrilateral,
-        counter-clockwise seen from the fifth corner, and that. Tetrahedron: four corners, of positive volume. The
-        places left are `NO_CORNER`.
-    tile : int32, (m,)
-        Which tile each is of, counted from 0 by name.
-    inner : int64, (i, 4)
-        Faces between two cells, out of the lower one; `NO_CORNER` in the last place of a triangle.
-    owner, neighbour : int64, (i,)
-        The two cells of each, ascending pairs.
-    outer : int64, (f, 4)
-        Faces of the boundary, counter-clockwise seen from outside; as `inner`.
-    outer_cell : int64, (f,)
-        Their cells, ascending.
-    marker : int32, (f,)
-        `pipeline.data.mesh.Marker` of each of them.
-    building : int64, (f,)
-        Number of its building, -1 where there is none.
-    ground : tuple of str
-        Names of the patches of the ground, by number; none without land cover.
-    leaves : float32, (m,), or None
-        Leaf area density of each cell (m2/m3), of a prism that of the middle one of its three tetrahedra; None
-        without trees.
-    region : int8, (m,), or None
-        `pipeline.data.regions.Region` of each cell; None where all is air.
-    between : int64, (g, 3)
-        Facets between two regions, out of the first (`pipeline.data.mesh.INTERFACES`); these are among `inner`.
-    between_marker, between_building
-        Of each of them, as `marker` and `building`.
-    """
-
+    #: (n, 3): points (m), by their numbers over the region; then the middles of prisms that are cut
     points: NDArray[np.float64]
+    #: (m, 6): prism: a triangle, counter-clockwise seen from above, and the corners over it. Pyramid: a
+    #: quadrilateral, counter-clockwise seen from the fifth corner, and that. Tetrahedron: four corners, of
+    #: positive volume. The places left are `NO_CORNER`
     cells: Ints
-    tile: NDArray[np.int32]
+    tile: NDArray[np.int32]  #: (m,): which tile each is of, counted from 0 by name
+    #: (i, 4): faces between two cells, out of the lower one; `NO_CORNER` in the last place of a triangle
     inner: Ints
+    #: (i,): the two cells of each, ascending pairs
     owner: Ints
     neighbour: Ints
-    outer: Ints
-    outer_cell: Ints
-    marker: NDArray[np.int32]
-    building: Ints
-    ground: tuple[str, ...] = ()
+    outer: Ints  #: (f, 4): faces of the boundary, counter-clockwise seen from outside; as `inner`
+    outer_cell: Ints  #: (f,): their cells, ascending
+    marker: NDArray[np.int32]  #: (f,): `pipeline.data.mesh.Marker` of each of them
+    building: Ints  #: (f,): number of its building, -1 where there is none
+    ground: tuple[str, ...] = ()  #: names of the patches of the ground, by number; none without land cover
+    #: (m,): leaf area density of each cell (m2/m3), of a prism that of the middle one of its three tetrahedra;
+    #: None without trees
     leaves: NDArray[np.float32] | None = None
+    #: (m,): `pipeline.data.regions.Region` of each cell; None where all is air
     region: NDArray[np.int8] | None = None
+    #: (g, 3): facets between two regions, out of the first (`pipeline.data.mesh.INTERFACES`); these are among
+    #: `inner`
     between: Ints = field(default_factory=lambda: np.empty((0, 3), np.int64))
+    #: of each of them, as `marker` and `building`
     between_marker: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     between_building: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 

@@ -13,41 +13,23 @@ MOST_ORIGIN = 1e9  # m
 
 @dataclass(frozen=True)
 class RunFiles:
-    """The files of a finished run that a writer may read.
+    """The files of a finished run that a writer may read."""
 
-    Attributes
-    ----------
-    directory : Path
-        Folder of the run.
-    volumes, boundaries : tuple of Path
-        VTU and VTP pieces, in the order of the index files: by name of tile.
-    depth : float
-        Depth of its soil (m), 0 where it has none.
-    parts : int
-        Parts of the mesh that share no face, 0 where its record does not tell.
-    sides : tuple of float or None
-        West, south, east and north side (m) of the part of the mesh that these are the files of; None where they
-        are those of the whole mesh.
-    origin : tuple of float
-        Place in the CRS (m) that coordinates are to count from.
-    ground : tuple of (str, float or None)
-        Patches of the ground by number: names and roughness lengths (m); none without land cover.
-    leaves : bool
-        Whether cells tell their leaf area density.
-    regions : tuple of Region
-        What cells are filled with.
-    """
-
-    directory: Path
+    directory: Path  #: folder of the run
+    #: VTU and VTP pieces, in the order of the index files: by name of tile
     volumes: tuple[Path, ...]
     boundaries: tuple[Path, ...]
-    depth: float = 0.0
-    parts: int = 0
+    depth: float = 0.0  #: depth of its soil (m), 0 where it has none
+    parts: int = 0  #: parts of the mesh that share no face, 0 where its record does not tell
+    #: west, south, east and north side (m) of the part of the mesh that these are the files of; None where they
+    #: are those of the whole mesh
     sides: tuple[float, float, float, float] | None = None
+    #: place in the CRS (m) that coordinates are to count from
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    #: patches of the ground by number: names and roughness lengths (m); none without land cover
     ground: tuple[tuple[str, float | None], ...] = ()
-    leaves: bool = False
-    regions: Regions = (Region.AIR,)
+    leaves: bool = False  #: whether cells tell their leaf area density
+    regions: Regions = (Region.AIR,)  #: what cells are filled with
 
     @property
     def ground_names(self) -> tuple[str, ...]:

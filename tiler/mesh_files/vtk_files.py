@@ -37,22 +37,14 @@ NO_ARRAYS: Arrays = {}
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """An array on its way to a file, some rows of it at a time.
+    """An array on its way to a file, some rows of it at a time."""
 
-    Attributes
-    ----------
-    n_rows, width : int
-        Number of rows, and of numbers in each.
-    dtype : dtype
-        Their type.
-    make : callable
-        ``make(i, j)`` makes the rows ``i`` to before ``j``: (j - i,) or (j - i, width). A row in which a block of
-        the file ends is asked for twice: none, where the width is a power of two.
-    """
-
+    #: number of rows, and of numbers in each
     n_rows: int
     width: int
-    dtype: np.dtype[Any]
+    dtype: np.dtype[Any]  #: their type
+    #: ``make(i, j)`` makes the rows ``i`` to before ``j``: (j - i,) or (j - i, width). A row in which a block of
+    #: the file ends is asked for twice: none, where the width is a power of two
     make: Callable[[int, int], NDArray[Any]]
 
     @classmethod
@@ -64,21 +56,11 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """What points have, made for those of them that are asked for.
+    """What points have, made for those of them that are asked for."""
 
-    Attributes
-    ----------
-    width : int
-        Numbers of each point.
-    dtype : dtype
-        Their type.
-    take : callable
-        ``take(index)`` makes those of some points: (k,) or (k, width).
-    """
-
-    width: int
-    dtype: np.dtype[Any]
-    take: Callable[[NDArray[Any]], NDArray[Any]]
+    width: int  #: numbers of each point
+    dtype: np.dtype[Any]  #: their type
+    take: Callable[[NDArray[Any]], NDArray[Any]]  #: ``take(index)`` makes those of some points: (k,) or (k, width)
 
     def rows(self, n_rows: int, index: Callable[[int, int], NDArray[Any]]) -> Rows:
         """Make rows of them: those of the points ``index(i, j)`` are rows ``i`` to before ``j``."""
@@ -91,44 +73,23 @@ ValueArrays = Mapping[str, Values]
 
 @dataclass(frozen=True, eq=False)
 class VolumePiece:
-    """What a VTU file holds.
+    """What a VTU file holds."""
 
-    Attributes
-    ----------
-    mesh : TetMesh
-        Its points and cells.
-    point_data, cell_data : mapping of name to array, first axis (n_points,) or (n_cells,)
-        Its further arrays.
-    """
-
-    mesh: TetMesh
+    mesh: TetMesh  #: its points and cells
+    #: its further arrays
     point_data: Arrays
     cell_data: Arrays
 
 
 @dataclass(frozen=True, eq=False)
 class BoundaryPiece:
-    """What a VTP file holds.
+    """What a VTP file holds."""
 
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        The vertices that facets use (m).
-    boundary : Boundary
-        Facets as indices of `points`, with their marks.
-    vertex : int64, (n,)
-        Index of each point among the points of the volume mesh.
-    point_data : mapping of name to array, first axis (n,)
-        Further arrays.
-    cell_data : mapping of name to array, first axis (k,)
-        Further arrays of facets.
-    """
-
-    points: NDArray[np.float64]
-    boundary: Boundary
-    vertex: NDArray[np.int64]
-    point_data: Arrays
-    cell_data: Arrays = field(default_factory=dict)
+    points: NDArray[np.float64]  #: (n, 3): the vertices that facets use (m)
+    boundary: Boundary  #: facets as indices of `points`, with their marks
+    vertex: NDArray[np.int64]  #: (n,): index of each point among the points of the volume mesh
+    point_data: Arrays  #: further arrays
+    cell_data: Arrays = field(default_factory=dict)  #: further arrays of facets
 
 
 def write_vtu_blocks(

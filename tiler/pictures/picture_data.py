@@ -29,28 +29,15 @@ FIRST_STEP = 1.0  # m, between vertices that are made one; doubled until there a
 
 @dataclass(frozen=True, eq=False)
 class Facets:
-    """Marked triangles.
+    """Marked triangles."""
 
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Vertices in the CRS (m).
-    corners : int64, (k, 3)
-        Rows of `points`.
-    marker, piece : int32, (k,)
-        `pipeline.data.mesh.Marker`, and row of the piece that each is of.
-    building : int64, (k,)
-        Number of the building, -1 on the ground.
-    quality : float32, (k,)
-        Radius ratio of the cell behind each; NaN where nobody asked.
-    """
-
-    points: NDArray[np.float64]
-    corners: NDArray[np.int64]
+    points: NDArray[np.float64]  #: (n, 3): vertices in the CRS (m)
+    corners: NDArray[np.int64]  #: (k, 3): rows of `points`
+    #: (k,): `pipeline.data.mesh.Marker`, and row of the piece that each is of
     marker: NDArray[np.int32]
     piece: NDArray[np.int32]
-    building: NDArray[np.int64]
-    quality: NDArray[np.float32]
+    building: NDArray[np.int64]  #: (k,): number of the building, -1 on the ground
+    quality: NDArray[np.float32]  #: (k,): radius ratio of the cell behind each; NaN where nobody asked
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -122,41 +109,19 @@ def coarsen(facets: Facets, size: float) -> Facets:
 
 @dataclass(frozen=True, eq=False)
 class City:
-    """The boundary, moved to the origin.
+    """The boundary, moved to the origin."""
 
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Vertices (m) from `origin`, each once.
-    facets : int32, (k, 3)
-        Ground, walls and roofs, counter-clockwise seen from the air.
-    marker : int32, (k,)
-        `Marker` of each facet.
-    building : int64, (k,)
-        Number of the building of each facet, -1 on the ground.
-    piece : int32, (k,)
-        Row of `names` for each facet.
-    names : tuple of str
-        Names of the pieces, which are those of tiles.
-    origin : float64, (3,)
-        Middle of the region, at the height of the lowest ground.
-    quality : float32, (k,)
-        Radius ratio of the cell behind each facet; none where nobody asked.
-    step : float
-        Vertices closer than some of this are one (m); 0 where all are shown.
-    level : int8, (k,)
-        Level of detail of each facet, see `load_levels`; none where nobody asked.
-    """
-
-    points: NDArray[np.float64]
-    facets: NDArray[np.int32]
-    marker: NDArray[np.int32]
-    building: NDArray[np.int64]
-    piece: NDArray[np.int32]
-    names: tuple[str, ...]
-    origin: NDArray[np.float64]
+    points: NDArray[np.float64]  #: (n, 3): vertices (m) from `origin`, each once
+    facets: NDArray[np.int32]  #: (k, 3): ground, walls and roofs, counter-clockwise seen from the air
+    marker: NDArray[np.int32]  #: (k,): `Marker` of each facet
+    building: NDArray[np.int64]  #: (k,): number of the building of each facet, -1 on the ground
+    piece: NDArray[np.int32]  #: (k,): row of `names` for each facet
+    names: tuple[str, ...]  #: names of the pieces, which are those of tiles
+    origin: NDArray[np.float64]  #: (3,): middle of the region, at the height of the lowest ground
+    #: (k,): radius ratio of the cell behind each facet; none where nobody asked
     quality: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
-    step: float = 0.0
+    step: float = 0.0  #: vertices closer than some of this are one (m); 0 where all are shown
+    #: (k,): level of detail of each facet, see `load_levels`; none where nobody asked
     level: NDArray[np.int8] = field(default_factory=lambda: np.empty(0, np.int8))
 
 

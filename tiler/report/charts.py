@@ -16,18 +16,10 @@ GANTT_LEFT, GANTT_ROW = 134, 18
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One line or set of bars of a histogram.
+    """One line or set of bars of a histogram."""
 
-    Attributes
-    ----------
-    name : str
-        For the legend.
-    share : float64, (n,)
-        Share of the values in each bin.
-    """
-
-    name: str
-    share: NDArray[np.float64]
+    name: str  #: for the legend
+    share: NDArray[np.float64]  #: (n,): share of the values in each bin
 
 
 def draw_histogram(title: str, axis: str, limits: tuple[float, float], series: Sequence[Series]) -> str:

@@ -19,24 +19,16 @@ NO_HISTOGRAM = np.empty(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Figures of all tiles, from the store.
+    """Figures of all tiles, from the store."""
 
-    Attributes
-    ----------
-    quality : dict of str to Histogram
-        Each measure over all cells (`pipeline.quality.histograms.QUALITY_BINS`); empty without pieces.
-    worst : float64, (n,)
-        Least radius ratio of each tile of `RunFacts.tiles`; NaN where the store does not tell.
-    buildings, terrain : Bins
-        Heights of buildings above their ground, and heights of the terrain's nodes.
-    footprints : uint8, (rows, columns)
-        How much of each pixel is within clean footprints, 0 to 255; row 0 in the north.
-    """
-
+    #: each measure over all cells (`pipeline.quality.histograms.QUALITY_BINS`); empty without pieces
     quality: dict[str, Histogram]
+    #: (n,): least radius ratio of each tile of `RunFacts.tiles`; NaN where the store does not tell
     worst: NDArray[np.float64]
+    #: heights of buildings above their ground, and heights of the terrain's nodes
     buildings: "Bins"
     terrain: "Bins"
+    #: (rows, columns): how much of each pixel is within clean footprints, 0 to 255; row 0 in the north
     footprints: NDArray[np.uint8]
 
 

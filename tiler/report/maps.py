@@ -22,24 +22,12 @@ FOOTPRINTS = "footprints"  # id of the image that further maps show again
 
 @dataclass(frozen=True, eq=False)
 class Mapped:
-    """Tiles, or blocks of tiles, with their texts.
+    """Tiles, or blocks of tiles, with their texts."""
 
-    Attributes
-    ----------
-    box : float64, (n, 4)
-        xmin, ymin, xmax, ymax (m).
-    value : float64, (n,)
-        Least value of a block's tiles, or their sum; NaN where it is not known.
-    label : list of str
-        Name of the tile, or of the block.
-    tiles_along : int
-        Tiles along the side of a block; 1 where each is drawn.
-    """
-
-    box: NDArray[np.float64]
-    value: NDArray[np.float64]
-    label: list[str]
-    tiles_along: int
+    box: NDArray[np.float64]  #: (n, 4): xmin, ymin, xmax, ymax (m)
+    value: NDArray[np.float64]  #: (n,): least value of a block's tiles, or their sum; NaN where it is not known
+    label: list[str]  #: name of the tile, or of the block
+    tiles_along: int  #: tiles along the side of a block; 1 where each is drawn
 
 
 def gather_tiles(

@@ -22,65 +22,32 @@ LISTED = ("unreadable", "missing", "set_aside")  # what failed
 
 @dataclass(frozen=True, eq=False)
 class NoteGroup:
-    """Notes of one kind.
+    """Notes of one kind."""
 
-    Attributes
-    ----------
-    kind : str
-        What happened, in kebab case.
-    count : int
-        How many there are.
-    items : list of dict
-        The first `SHOWN`: ``subject`` and ``detail``, and ``x`` and ``y`` (m) where there is a place.
-    places : float64, (n, 2)
-        Places of the first `PLACES` that have one (m).
-    """
-
-    kind: str
-    count: int
+    kind: str  #: what happened, in kebab case
+    count: int  #: how many there are
+    #: the first `SHOWN`: ``subject`` and ``detail``, and ``x`` and ``y`` (m) where there is a place
     items: list[dict[str, Any]]
-    places: NDArray[np.float64]
+    places: NDArray[np.float64]  #: (n, 2): places of the first `PLACES` that have one (m)
 
 
 @dataclass(frozen=True, eq=False)
 class TileTable:
-    """Tiles that are done.
+    """Tiles that are done."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Their names, in the order of the record.
-    box : float64, (n, 4)
-        xmin, ymin, xmax, ymax (m).
-    cells : int64, (n,)
-        Cells of each.
-    """
-
-    names: tuple[str, ...]
-    box: NDArray[np.float64]
-    cells: NDArray[np.int64]
+    names: tuple[str, ...]  #: their names, in the order of the record
+    box: NDArray[np.float64]  #: (n, 4): xmin, ymin, xmax, ymax (m)
+    cells: NDArray[np.int64]  #: (n,): cells of each
 
 
 @dataclass(frozen=True, eq=False)
 class RunFacts:
-    """A run as its record describes it.
+    """A run as its record describes it."""
 
-    Attributes
-    ----------
-    members : dict
-        All members of the record but tiles and notes; of `LISTED` ones the first `KEPT`.
-    lengths : dict of str to int
-        How many entries those of `LISTED` have.
-    tiles : TileTable
-        Tiles that are done; none where the run failed.
-    notes : tuple of NoteGroup
-        What was dropped, repaired or defaulted, by kind.
-    """
-
-    members: dict[str, Any]
-    lengths: dict[str, int]
-    tiles: TileTable
-    notes: tuple[NoteGroup, ...]
+    members: dict[str, Any]  #: all members of the record but tiles and notes; of `LISTED` ones the first `KEPT`
+    lengths: dict[str, int]  #: how many entries those of `LISTED` have
+    tiles: TileTable  #: tiles that are done; none where the run failed
+    notes: tuple[NoteGroup, ...]  #: what was dropped, repaired or defaulted, by kind
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:

@@ -41,25 +41,17 @@ KINDS = (
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What was measured.
+    """What was measured."""
 
-    Attributes
-    ----------
-    tiles, all_tiles : int
-        Tiles that were looked at, and all.
-    n_points, all_points : int
-        Points that were looked at, and all that lie on these tiles.
-    near : dict of str to Histogram
-        Quality of the cells of air whose triangle's centre is within `NEAR` of a seam; empty where there is none.
-    points : dict of str to ResidualSums
-        Heights of the mesh's lower surface over points, by class and by what the surface is: ``"roof on ground"``.
-    """
-
+    #: tiles that were looked at, and all
     tiles: int
     all_tiles: int
+    #: points that were looked at, and all that lie on these tiles
     n_points: int
     all_points: int
+    #: quality of the cells of air whose triangle's centre is within `NEAR` of a seam; empty where there is none
     near: dict[str, Histogram]
+    #: heights of the mesh's lower surface over points, by class and by what the surface is: ``"roof on ground"``
     points: dict[str, ResidualSums]
 
 

@@ -18,33 +18,19 @@ BINS = 240  # columns of the Gantt chart
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """How busy each group of stages was over the time of a run (`tiler.words.stage_groups`).
+    """How busy each group of stages was over the time of a run (`tiler.words.stage_groups`)."""
 
-    Attributes
-    ----------
-    duration : float
-        From the first task's beginning to the last one's end (s).
-    stages : tuple of str
-        Groups in the order in which they began.
-    busy : float64, (n_stages, BINS)
-        Tasks at work in each slice of time, in the mean.
-    first, last : float64, (n_stages,)
-        When the first task of each began and the last one ended (s after the beginning).
-    tasks, reused, failed : int64, (n_stages,)
-        Tasks of each that ended well, those of them that took an earlier result, and those that failed.
-    by_tile : dict of str to float
-        Time of all tasks of each tile (s), of the stages that have one a tile.
-    """
-
-    duration: float
-    stages: tuple[str, ...]
-    busy: NDArray[np.float64]
+    duration: float  #: from the first task's beginning to the last one's end (s)
+    stages: tuple[str, ...]  #: groups in the order in which they began
+    busy: NDArray[np.float64]  #: (n_stages, BINS): tasks at work in each slice of time, in the mean
+    #: (n_stages,): when the first task of each began and the last one ended (s after the beginning)
     first: NDArray[np.float64]
     last: NDArray[np.float64]
+    #: (n_stages,): tasks of each that ended well, those of them that took an earlier result, and those that failed
     tasks: NDArray[np.int64]
     reused: NDArray[np.int64]
     failed: NDArray[np.int64]
-    by_tile: dict[str, float]
+    by_tile: dict[str, float]  #: time of all tasks of each tile (s), of the stages that have one a tile
 
 
 def read_timeline(path: Path, tiles: frozenset[str]) -> Timeline | None:

@@ -37,35 +37,16 @@ class Outline(NamedTuple):
 
 @dataclass(frozen=True)
 class Edit:
-    """One edit: what is taken away, and what comes.
+    """One edit: what is taken away, and what comes."""
 
-    Attributes
-    ----------
-    number : int
-        From 1, ascending.
-    date : str
-        Day from which on it holds, YYYY-MM-DD.
-    action : str
-        ``"replace"``, ``"remove"`` or ``"add"``.
-    source : str
-        Name of the file that was uploaded; ``""`` for none.
-    removed : tuple of (str, box)
-        Ids that are taken away, each with the box of its outline (m).
-    outlines : tuple of Outline
-        Footprints that come, in the region's CRS.
-    boxes : tuple of box
-        That of each of these (m).
-    request, digest : str
-        Name that a client gave it, and a hash of what it sent: who asks once more is told that it is done.
-    """
-
-    number: int
-    date: str
-    action: str
-    source: str
-    removed: tuple[Place, ...]
-    outlines: tuple[Outline, ...]
-    boxes: tuple[Box, ...]
+    number: int  #: from 1, ascending
+    date: str  #: day from which on it holds, YYYY-MM-DD
+    action: str  #: ``"replace"``, ``"remove"`` or ``"add"``
+    source: str  #: name of the file that was uploaded; ``""`` for none
+    removed: tuple[Place, ...]  #: each (str, box): ids that are taken away, each with the box of its outline (m)
+    outlines: tuple[Outline, ...]  #: footprints that come, in the region's CRS
+    boxes: tuple[Box, ...]  #: that of each of these (m)
+    #: name that a client gave it, and a hash of what it sent: who asks once more is told that it is done
     request: str = ""
     digest: str = ""
 
@@ -77,18 +58,11 @@ class Edit:
 
 @dataclass(frozen=True)
 class Edits:
-    """What all edits of a journal come to.
+    """What all edits of a journal come to."""
 
-    Attributes
-    ----------
-    removed : tuple of (str, box)
-        Footprints of the input, and of earlier edits, that are gone; sorted.
-    outlines : tuple of (Outline, box)
-        Those that are there, by id.
-    """
-
+    #: each (str, box): footprints of the input, and of earlier edits, that are gone; sorted
     removed: tuple[Place, ...] = ()
-    outlines: tuple[tuple[Outline, Box], ...] = ()
+    outlines: tuple[tuple[Outline, Box], ...] = ()  #: each (Outline, box): those that are there, by id
 
     @property
     def boxes(self) -> list[Box]:

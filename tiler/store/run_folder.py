@@ -52,32 +52,16 @@ class GroundPatch:
 
 @dataclass(frozen=True)
 class RoofRules:
-    """How far the mesher may move roofs at their outlines.
+    """How far the mesher may move roofs at their outlines."""
 
-    Attributes
-    ----------
-    sloped : bool
-        Whether roofs are planes; flat ones are exact.
-    step : float
-        Largest step by which it parts two roofs that meet (m).
-    clearance : float
-        Height above the terrain at its walls up to which it raises a roof (m).
-    joined : float
-        Roofs closer than this are always joined (m).
-    lifts : bool
-        Whether the least distance of two nodes may be more than the step, so that the upper one is raised.
-    slack : float
-        How far a roof may be moved besides, where the boundary's `ROOF_MOVED` says so (m).
-    raised : float
-        Height above the terrain at its walls up to which the city model raises a flat roof, at least (m).
-    """
-
-    sloped: bool = False
-    step: float = 0.0
-    clearance: float = 0.0
-    joined: float = 0.0
+    sloped: bool = False  #: whether roofs are planes; flat ones are exact
+    step: float = 0.0  #: largest step by which it parts two roofs that meet (m)
+    clearance: float = 0.0  #: height above the terrain at its walls up to which it raises a roof (m)
+    joined: float = 0.0  #: roofs closer than this are always joined (m)
+    #: whether the least distance of two nodes may be more than the step, so that the upper one is raised
     lifts: bool = False
-    slack: float = 0.0
+    slack: float = 0.0  #: how far a roof may be moved besides, where the boundary's `ROOF_MOVED` says so (m)
+    #: height above the terrain at its walls up to which the city model raises a flat roof, at least (m)
     raised: float = 0.0
 
 
@@ -86,93 +70,43 @@ FLAT_ROOFS = RoofRules()
 
 @dataclass(frozen=True)
 class SizesAsked:
-    """Target edge lengths of a run beside those of its zones.
+    """Target edge lengths of a run beside those of its zones."""
 
-    Attributes
-    ----------
-    mesh_size, largest : float
-        That outside of zones, and the largest one in the open (m).
-    growth : float
-        Growth from edge to edge around zones.
-    alone : bool
-        Whether nothing else makes triangles finer: walls, further areas, land cover.
-    even : bool
-        Whether the vertical spacing does not grow from the ground upwards.
-    clearance : float
-        Least distance of walls, also from the region's sides (m).
-    """
-
+    #: that outside of zones, and the largest one in the open (m)
     mesh_size: float = 10.0
     largest: float = 10.0
-    growth: float = 1.2
-    alone: bool = False
-    even: bool = True
-    clearance: float = 1.0
+    growth: float = 1.2  #: growth from edge to edge around zones
+    alone: bool = False  #: whether nothing else makes triangles finer: walls, further areas, land cover
+    even: bool = True  #: whether the vertical spacing does not grow from the ground upwards
+    clearance: float = 1.0  #: least distance of walls, also from the region's sides (m)
 
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The part of ``run.json`` that the files can be held against.
+    """The part of ``run.json`` that the files can be held against."""
 
-    Attributes
-    ----------
-    status : str
-        ``"done"`` when every tile is.
-    bounds : tuple of 4 floats
-        West, south, east and north border of the region (m).
-    top : float
-        Absolute height of the top (m) where the mesher makes it flat, NaN where it does not.
-    counts : mapping of str to int
-        ``cells``, ``points``, ``facets`` and ``building parts``.
-    tiles : mapping of str to tuple of 4 floats or None
-        Boxes of the tiles by name (m), as far as they are stated.
-    depth : float
-        Depth of the soil below the terrain (m), 0 where there is none.
-    solids : bool
-        Whether buildings have cells.
-    core : tuple of 4 floats or None
-        The region without its pad (m); None without a pad.
-    rim : float
-        Height of the ground along the outer sides of the pad (m), NaN without one.
-    parts : tuple of MeshPart
-        Parts of the mesh, that of the most cells first; of many those beyond the first are empty. None at all
-        where the record does not tell.
-    roofs : RoofRules
-        How far the mesher may move roofs.
-    ground : tuple of GroundPatch
-        Patches of the ground by number, without land cover none.
-    dtm_spacing : float
-        Distance between nodes of the terrain (m).
-    leaves : bool
-        Whether cells tell their leaf area density.
-    leaf_column : float
-        Side of the columns in which that is known (m).
-    zones : Zones
-        Zones of detail; none where all buildings have one level.
-    level_counts : mapping of str to int
-        Building parts at each level of detail, where there are zones, and `CELLS_REPLACED`.
-    sizes : SizesAsked
-        Other sizes, where there are zones.
-    """
-
-    status: str
-    bounds: tuple[float, float, float, float]
-    top: float
-    counts: Mapping[str, int]
+    status: str  #: ``"done"`` when every tile is
+    bounds: tuple[float, float, float, float]  #: west, south, east and north border of the region (m)
+    top: float  #: absolute height of the top (m) where the mesher makes it flat, NaN where it does not
+    counts: Mapping[str, int]  #: ``cells``, ``points``, ``facets`` and ``building parts``
+    #: boxes of the tiles by name (m), as far as they are stated
     tiles: Mapping[str, tuple[float, ...] | None] = field(default_factory=dict)
-    depth: float = 0.0
-    core: tuple[float, float, float, float] | None = None
-    rim: float = math.nan
+    depth: float = 0.0  #: depth of the soil below the terrain (m), 0 where there is none
+    core: tuple[float, float, float, float] | None = None  #: the region without its pad (m); None without a pad
+    rim: float = math.nan  #: height of the ground along the outer sides of the pad (m), NaN without one
+    #: parts of the mesh, that of the most cells first; of many those beyond the first are empty. None at all where
+    #: the record does not tell
     parts: tuple[MeshPart, ...] = ()
-    roofs: RoofRules = FLAT_ROOFS
-    ground: tuple[GroundPatch, ...] = ()
-    dtm_spacing: float = 1.0
-    leaves: bool = False
-    leaf_column: float = 2.0
-    zones: Zones = ()
+    roofs: RoofRules = FLAT_ROOFS  #: how far the mesher may move roofs
+    ground: tuple[GroundPatch, ...] = ()  #: patches of the ground by number, without land cover none
+    dtm_spacing: float = 1.0  #: distance between nodes of the terrain (m)
+    leaves: bool = False  #: whether cells tell their leaf area density
+    leaf_column: float = 2.0  #: side of the columns in which that is known (m)
+    zones: Zones = ()  #: zones of detail; none where all buildings have one level
+    #: building parts at each level of detail, where there are zones, and `CELLS_REPLACED`
     level_counts: Mapping[str, int] = field(default_factory=dict)
-    solids: bool = False
-    sizes: SizesAsked = SizesAsked()
+    solids: bool = False  #: whether buildings have cells
+    sizes: SizesAsked = SizesAsked()  #: other sizes, where there are zones
 
     @property
     def regions(self) -> Regions:
@@ -182,25 +116,15 @@ class RunRecord:
 
 @dataclass(frozen=True, eq=False)
 class Buildings:
-    """Buildings of a CityJSON file, by ascending number.
+    """Buildings of a CityJSON file, by ascending number."""
 
-    Attributes
-    ----------
-    numbers : int64, (n,)
-        Attribute ``number``: what the boundary's array ``building`` refers to.
-    footprints : object, (n,)
-        shapely Polygons, or MultiPolygons where the file has several surfaces (m).
-    ground, roof : float64, (n,)
-        Attributes ``ground_height`` and ``roof_height``, absolute (m): of a sloped roof the highest place.
-    roofs : Roofs
-        Roofs, by attribute ``roof_plane``; flat at `roof` where a building has none.
-    """
-
-    numbers: NDArray[np.int64]
+    numbers: NDArray[np.int64]  #: (n,): attribute ``number``: what the boundary's array ``building`` refers to
+    #: (n,): shapely Polygons, or MultiPolygons where the file has several surfaces (m)
     footprints: NDArray[np.object_]
+    #: (n,): attributes ``ground_height`` and ``roof_height``, absolute (m): of a sloped roof the highest place
     ground: NDArray[np.float64]
     roof: NDArray[np.float64]
-    roofs: Roofs
+    roofs: Roofs  #: roofs, by attribute ``roof_plane``; flat at `roof` where a building has none
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -44,21 +44,12 @@ class Content:
 
 @dataclass(frozen=True, eq=False)
 class SortedPiece:
-    """The boundary of a tile of the run.
+    """The boundary of a tile of the run."""
 
-    Attributes
-    ----------
-    ground : dict of int to float64, (k, `ROW`)
-        Its ground in each cell, by code; sorted, so that the mesher's order of facets does not count.
-    digests : dict of int to str
-        Hash of each.
-    lowest : dict of int to float
-        Lowest wall (m) of each building that it has, by number.
-    """
-
+    #: its ground in each cell, by code; sorted, so that the mesher's order of facets does not count
     ground: dict[int, Array]
-    digests: dict[int, str]
-    lowest: dict[int, float]
+    digests: dict[int, str]  #: hash of each
+    lowest: dict[int, float]  #: lowest wall (m) of each building that it has, by number
 
 
 @dataclass(frozen=True, eq=False)

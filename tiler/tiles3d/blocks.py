@@ -29,26 +29,16 @@ COLUMNS = ["id", "parent", "height", "ground_height", "members", "landmark"]
 
 @dataclass(frozen=True)
 class Block:
-    """An object of LoD0C, LoD0B or LoD0A that stands for several houses.
+    """An object of LoD0C, LoD0B or LoD0A that stands for several houses."""
 
-    Attributes
-    ----------
-    id, level : str
-        Its id, and its level, a key of `LAYERS`.
-    members : int
-        Number of houses.
-    ground, top : float
-        Heights of its ground and of its roof (m).
-    side : float
-        Side of a square of its area (m).
-    """
-
+    #: its id, and its level, a key of `LAYERS`
     id: str
     level: str
-    members: int
+    members: int  #: number of houses
+    #: heights of its ground and of its roof (m)
     ground: float
     top: float
-    side: float
+    side: float  #: side of a square of its area (m)
 
 
 Pieces = Mapping[str, tuple[Block, Any]]  # by id: blocks, and their outlines as far as they lie in a cell

@@ -50,73 +50,35 @@ STEP = 0.001  # of coordinates of the city model (m)
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A building, or part of one, at its most detailed level.
+    """A building, or part of one, at its most detailed level."""
 
-    Attributes
-    ----------
-    id, house : str
-        Its id, and that of the building that it is a part of.
-    lod : str
-        Level of detail.
-    attributes : dict
-        Those of `TEXTS` and `NUMBERS` that it has.
-    footprint : str
-        Its outline, as WKB in hexadecimal digits.
-    xyz : list of [float, float, float]
-        Vertices (m); those at the bottom are at the lowest ground beside it.
-    triangles : list of [int, int, int]
-        Their corners.
-    roof : list of bool
-        Whether each triangle is of the roof.
-    blocks : list of str
-        Ids of the blocks that it is in, the lowest level first.
-    """
-
+    #: its id, and that of the building that it is a part of
     id: str
     house: str
-    lod: str
-    attributes: dict[str, Any]
-    footprint: str
-    xyz: list[list[float]]
-    triangles: list[list[int]]
-    roof: list[bool]
-    blocks: list[str] = field(default_factory=list)
+    lod: str  #: level of detail
+    attributes: dict[str, Any]  #: those of `TEXTS` and `NUMBERS` that it has
+    footprint: str  #: its outline, as WKB in hexadecimal digits
+    xyz: list[list[float]]  #: vertices (m); those at the bottom are at the lowest ground beside it
+    triangles: list[list[int]]  #: their corners
+    roof: list[bool]  #: whether each triangle is of the roof
+    blocks: list[str] = field(default_factory=list)  #: ids of the blocks that it is in, the lowest level first
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """A part as it is, or a block that stands for parts of a house or for several houses.
+    """A part as it is, or a block that stands for parts of a house or for several houses."""
 
-    Attributes
-    ----------
-    house : str
-        Id of the house; ``""`` of several.
-    outline : shapely geometry
-        Outline in the CRS (m).
-    bottom, low, high : float
-        Lowest ground beside it, and lowest and highest place of the roofs that it stands for (m).
-    attributes : dict
-        Those of `TEXTS` and `NUMBERS` that it has.
-    moved : float
-        How far its outline is from that of the parts (m), at most.
-    part : Part or None
-        The part itself; None for a block.
-    blocks : list of str
-        Ids of the blocks that it is in, the lowest level first.
-    block : Block or None
-        What stands for several houses.
-    """
-
-    house: str
-    outline: Any
+    house: str  #: id of the house; ``""`` of several
+    outline: Any  #: outline in the CRS (m)
+    #: lowest ground beside it, and lowest and highest place of the roofs that it stands for (m)
     bottom: float
     low: float
     high: float
-    attributes: dict[str, Any]
-    moved: float = 0.0
-    part: Part | None = None
-    blocks: Sequence[str] = ()
-    block: Block | None = None
+    attributes: dict[str, Any]  #: those of `TEXTS` and `NUMBERS` that it has
+    moved: float = 0.0  #: how far its outline is from that of the parts (m), at most
+    part: Part | None = None  #: the part itself; None for a block
+    blocks: Sequence[str] = ()  #: ids of the blocks that it is in, the lowest level first
+    block: Block | None = None  #: what stands for several houses
 
     @property
     def top(self) -> float:

@@ -23,22 +23,14 @@ Cell = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class CellGrid:
-    """The quadtree over a region.
+    """The quadtree over a region."""
 
-    Attributes
-    ----------
-    west, south : int
-        Column and row of the root's south-western smallest cell, from longitude and latitude 0 on.
-    width : int
-        Width of a cell in `STEP`: 1 at the equator, 2 from 45 degrees on, so that cells are nearly square.
-    depth : int
-        Level of the smallest cells.
-    """
-
+    #: column and row of the root's south-western smallest cell, from longitude and latitude 0 on
     west: int
     south: int
+    #: width of a cell in `STEP`: 1 at the equator, 2 from 45 degrees on, so that cells are nearly square
     width: int
-    depth: int
+    depth: int  #: level of the smallest cells
 
     @property
     def side(self) -> float:

@@ -41,27 +41,14 @@ KINDS = {"POSITION": 0, "NORMAL": 1, "_FEATURE_ID_0": 4}  # Draco's types of att
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles, each of a material, on vertices of which each belongs to a feature.
+    """Triangles, each of a material, on vertices of which each belongs to a feature."""
 
-    Attributes
-    ----------
-    xyz : float64, (n, 3)
-        Vertices in the CRS (m). Faces that meet in an edge to be seen have vertices of their own.
-    triangles : int64, (m, 3)
-        Their corners, counter-clockwise seen from outside.
-    material : int64, (m,)
-        `pipeline.data.mesh.Marker`, or the number of a patch of ground.
-    feature : int64, (n,)
-        Row of each vertex in the table of features.
-    skirt : int
-        How many of the last vertices hang from a border: they are lit like level ground.
-    """
-
+    #: (n, 3): vertices in the CRS (m). Faces that meet in an edge to be seen have vertices of their own
     xyz: Array
-    triangles: Ints
-    material: Ints
-    feature: Ints
-    skirt: int = 0
+    triangles: Ints  #: (m, 3): their corners, counter-clockwise seen from outside
+    material: Ints  #: (m,): `pipeline.data.mesh.Marker`, or the number of a patch of ground
+    feature: Ints  #: (n,): row of each vertex in the table of features
+    skirt: int = 0  #: how many of the last vertices hang from a border: they are lit like level ground
 
 
 @dataclass(frozen=True, eq=False)

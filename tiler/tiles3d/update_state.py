@@ -39,28 +39,16 @@ MODEL = "model"  # stage of the buildings that a tile owns, as they are meshed
 
 @dataclass(frozen=True)
 class RunTile:
-    """What cells took from a tile of the run.
+    """What cells took from a tile of the run."""
 
-    Attributes
-    ----------
-    model, boundary : str
-        Digests of its buildings, and of its piece of the boundary.
-    ground : dict of str to str
-        Hash of its ground in each cell, by code.
-    lowest : dict of str to float
-        Lowest wall (m) of each building of the piece, by number.
-    parts : dict of str to (str, int, str, int or None)
-        House, number, hash and smallest cell of each building or part that it owns, by id; None without a solid.
-    ground_height : float or None
-        Lowest ground (m) of these.
-    """
-
+    #: digests of its buildings, and of its piece of the boundary
     model: str
     boundary: str
-    ground: dict[str, str]
-    lowest: dict[str, float]
+    ground: dict[str, str]  #: hash of its ground in each cell, by code
+    lowest: dict[str, float]  #: lowest wall (m) of each building of the piece, by number
+    #: house, number, hash and smallest cell of each building or part that it owns, by id; None without a solid
     parts: dict[str, tuple[str, int, str, int | None]]
-    ground_height: float | None
+    ground_height: float | None  #: lowest ground (m) of these
 
     @property
     def numbers(self) -> dict[int, float]:

@@ -15,24 +15,12 @@ NO_CLASS = 0  # where there is no wind to speak of: houses, beyond the region
 
 @dataclass(frozen=True)
 class Criterion:
-    """A scale of classes, from the best to the worst.
+    """A scale of classes, from the best to the worst."""
 
-    Attributes
-    ----------
-    title : str
-        What it is, for people.
-    names : tuple of str
-        Names of the classes 1, 2, ...
-    speeds : tuple of float
-        Speed (m/s) whose exceedance ends each class but the last.
-    shares : tuple of float
-        Part of the time up to which it may be exceeded, for each of these.
-    """
-
-    title: str
-    names: tuple[str, ...]
-    speeds: tuple[float, ...]
-    shares: tuple[float, ...]
+    title: str  #: what it is, for people
+    names: tuple[str, ...]  #: names of the classes 1, 2, ...
+    speeds: tuple[float, ...]  #: speed (m/s) whose exceedance ends each class but the last
+    shares: tuple[float, ...]  #: part of the time up to which it may be exceeded, for each of these
 
     def classify(self, exceeded: Exceeded) -> Classes:
         """Return the class of each place: the first whose speed is exceeded for less than its share of the time.
@@ -75,22 +63,13 @@ CRITERIA = {
 
 @dataclass(frozen=True, eq=False)
 class LocalWind:
-    """The wind at places for all simulated directions.
+    """The wind at places for all simulated directions."""
 
-    Attributes
-    ----------
-    rose : WindRose
-        The climate.
-    factors : float64, (d, ...)
-        For each simulated direction the local speed over that of the undisturbed wind at the rose's height; NaN
-        where it is unknown.
-    of_row : int64, (n,)
-        Simulated direction of each row of the rose.
-    """
-
-    rose: WindRose
+    rose: WindRose  #: the climate
+    #: (d, ...): for each simulated direction the local speed over that of the undisturbed wind at the rose's
+    #: height; NaN where it is unknown
     factors: Floats
-    of_row: NDArray[np.int64]
+    of_row: NDArray[np.int64]  #: (n,): simulated direction of each row of the rose
 
     def mean_speed(self) -> Floats:
         """Return the mean speed over the time at each place (m/s)."""

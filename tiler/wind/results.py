@@ -22,24 +22,12 @@ FIELDS = ("U", "k")
 
 @dataclass(frozen=True, eq=False)
 class WindCase:
-    """An exported wind case.
+    """An exported wind case."""
 
-    Attributes
-    ----------
-    folder : Path
-        The export.
-    wind : Wind
-        The undisturbed wind.
-    crs : str
-        CRS of the coordinates.
-    origin : tuple of float
-        Place in it (m) that those of the case count from.
-    """
-
-    folder: Path
-    wind: Wind
-    crs: str
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    folder: Path  #: the export
+    wind: Wind  #: the undisturbed wind
+    crs: str  #: CRS of the coordinates
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: place in it (m) that those of the case count from
 
     def case_of(self, direction: float) -> Path:
         """Return the folder of a direction."""

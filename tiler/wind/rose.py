@@ -19,27 +19,13 @@ MARGIN = 1e-3  # by which shares may add up to more than all
 
 @dataclass(frozen=True, eq=False)
 class WindRose:
-    """The climate of the wind at the reference height, ``n`` rows.
+    """The climate of the wind at the reference height, ``n`` rows."""
 
-    Attributes
-    ----------
-    direction : float64, (n,)
-        Where the wind comes from (degrees from north).
-    share : float64, (n,)
-        Part of the time; they add up to 1 less `calm`.
-    speed : float64, (n,)
-        Weibull's scale, or where `shape` is NaN the speed itself (m/s).
-    shape : float64, (n,)
-        Weibull's shape.
-    calm : float
-        Part of the time without wind.
-    """
-
-    direction: Floats
-    share: Floats
-    speed: Floats
-    shape: Floats
-    calm: float
+    direction: Floats  #: (n,): where the wind comes from (degrees from north)
+    share: Floats  #: (n,): part of the time; they add up to 1 less `calm`
+    speed: Floats  #: (n,): weibull's scale, or where `shape` is NaN the speed itself (m/s)
+    shape: Floats  #: (n,): weibull's shape
+    calm: float  #: part of the time without wind
 
     def mean_speed(self) -> Floats:
         """Return the mean speed of each row (m/s), (n,).

@@ -23,21 +23,12 @@ RECORD = "wind.json"
 
 @dataclass(frozen=True)
 class WindMaps:
-    """What to draw.
+    """What to draw."""
 
-    Attributes
-    ----------
-    rose : Path
-        CSV file of the wind rose; see `read_rose`.
-    rose_height : float, optional
-        Height at which its speeds are (m); that of the case's reference speed if not given.
-    resolution : float
-        Size of pixels (m).
-    """
-
-    rose: Path
+    rose: Path  #: CSV file of the wind rose; see `read_rose`
+    #: height at which its speeds are (m); that of the case's reference speed if not given
     rose_height: float | None = None
-    resolution: float = 1.0
+    resolution: float = 1.0  #: size of pixels (m)
 
 
 def assess_wind(directory: Path, output: Path, maps: WindMaps, *, overwrite: bool = False) -> list[str]:

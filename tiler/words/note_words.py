@@ -10,22 +10,13 @@ CHOICE = re.compile(r"\[([^]|]*)(?:\|([^]]*))?\]")
 
 @dataclass(frozen=True)
 class Words:
-    """The words for a kind of note.
+    """The words for a kind of note."""
 
-    Attributes
-    ----------
-    group : str
-        One of `GROUPS`.
-    sentence : str
-        With ``{n}`` for the number of notes; ``[s]`` stands for an ending of the plural, ``[was|were]`` for a word
-        of the singular or of the plural.
-    reason : str
-        Of what is lost: why one building is not in the mesh; empty where nothing is lost by it.
-    """
-
-    group: str
+    group: str  #: one of `GROUPS`
+    #: with ``{n}`` for the number of notes; ``[s]`` stands for an ending of the plural, ``[was|were]`` for a word
+    #: of the singular or of the plural
     sentence: str
-    reason: str = ""
+    reason: str = ""  #: of what is lost: why one building is not in the mesh; empty where nothing is lost by it
 
 
 WORDS: dict[str, Words] = {

@@ -28,21 +28,11 @@ AROUND = 2  # tiles on every side that a tile alone is run with, for clusters of
 
 @dataclass(frozen=True)
 class Missing:
-    """Tiles that a run has left out, by name, each with what failed.
+    """Tiles that a run has left out, by name, each with what failed."""
 
-    Attributes
-    ----------
-    tiles : dict of str to SetAside
-        Why each tile is missing.
-    files : frozenset of str
-        Files that could not be read, by the name of their item.
-    others : tuple of SetAside
-        What failed without taking a tile with it: stages of the user's own, fit.
-    """
-
-    tiles: dict[str, SetAside] = dataclasses.field(default_factory=dict)
-    files: frozenset[str] = frozenset()
-    others: tuple[SetAside, ...] = ()
+    tiles: dict[str, SetAside] = dataclasses.field(default_factory=dict)  #: why each tile is missing
+    files: frozenset[str] = frozenset()  #: files that could not be read, by the name of their item
+    others: tuple[SetAside, ...] = ()  #: what failed without taking a tile with it: stages of the user's own, fit
 
 
 class HolesError(Exception):

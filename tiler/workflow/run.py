@@ -78,24 +78,12 @@ SCHEMA = 1  # version of run.json's layout
 
 @dataclass(frozen=True)
 class _Means:
-    """What a run is done with.
+    """What a run is done with."""
 
-    Attributes
-    ----------
-    dashboard : str or None
-        Where its page is shown, ``HOST:PORT``.
-    shown : Path
-        Folder of the events that the page is made of.
-    cluster : Executor or None
-        Of the scheduler that was asked for, or what the caller gave.
-    city_files : bool
-        Whether the files of the city models are written.
-    """
-
-    dashboard: str | None
-    shown: Path
-    cluster: Executor | None
-    city_files: bool
+    dashboard: str | None  #: where its page is shown, ``HOST:PORT``
+    shown: Path  #: folder of the events that the page is made of
+    cluster: Executor | None  #: of the scheduler that was asked for, or what the caller gave
+    city_files: bool  #: whether the files of the city models are written
 
 
 def run(
