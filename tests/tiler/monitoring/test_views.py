@@ -452,7 +452,7 @@ def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int)
     bar = min(60, width - 58)
     for rows in views:
         assert re.fullmatch(rf"  all {{14}}[━─]{{{bar}}} +\d+%.* \d+ of 7 steps", rows[-2])
-        assert re.fullmatch(r"  0:00:\d\d, 2 workers, \d+ tasks? in hand.*", rows[-1])
+        assert re.fullmatch(r"  0:\d\d:\d\d, 2 workers, \d+ tasks? in hand.*", rows[-1])
         # One view, and above it nothing but finished stages and stages at work: no row was wrapped or left behind.
         assert sum("in hand" in row and "workers" in row for row in rows) == 1
         for row in rows[:-2]:
