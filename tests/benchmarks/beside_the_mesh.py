@@ -106,9 +106,9 @@ def table(rows: dict[str, list[Measured]]) -> list[str]:
         f"Written by `python -m tests.benchmarks.beside_the_mesh` on {time.strftime('%Y-%m-%d')}; do not edit.",
         "The city of 2.5 km (`citystitch synth CITY --size 2500 --buildings 3000`), medians of "
         f"{len(first)} in turn,",
-        "on a busy machine (two cores shared with others), where processor time (user and system, of all",
-        "processes) says more than wall time. The run has two workers: on two free cores the ratio in wall time",
-        "of what is one process is up to twice that in processor time. Memory is that of the largest process.",
+        f"on two cores (load at the end {os.getloadavg()[0]:.1f}); processor time is user and system, of all",
+        "processes. The run has two workers: on two free cores the ratio in wall time of what is one process is up",
+        "to twice that in processor time. Memory is that of the largest process.",
         "",
         "| command | wall (s) | of the run | processor (s) | of the run | memory |",
         "|---|---|---|---|---|---|",
