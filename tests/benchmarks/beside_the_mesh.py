@@ -107,8 +107,8 @@ def table(rows: dict[str, list[Measured]]) -> list[str]:
         "The city of 2.5 km (`citystitch synth CITY --size 2500 --buildings 3000`), medians of "
         f"{len(first)} in turn,",
         f"on two cores (load at the end {os.getloadavg()[0]:.1f}); processor time is user and system, of all",
-        "processes. The run has two workers: on two free cores the ratio in wall time of what is one process is up",
-        "to twice that in processor time. Memory is that of the largest process.",
+        "processes. The run has two workers: on two free cores the ratio in wall time of what is one process is",
+        "up to twice that in processor time. Memory is that of the largest process.",
         "",
         "| command | wall (s) | of the run | processor (s) | of the run | memory |",
         "|---|---|---|---|---|---|",
