@@ -223,8 +223,11 @@ def test_common_ground_goes_to_the_higher_house_where_roofs_are_known(height: fl
 
 
 def test_a_cluster_whose_roofs_would_be_off_keeps_a_finer_clearance() -> None:
-    """A party wall with a step of 0.4 m, between 5 and 45 m; and the same one between 5 and 5.2 m elsewhere."""
-    low = Polygon([(0, 0), (10, 0), (10, 5), (10.4, 5), (10.4, 10), (0, 10)])
+    """A party wall with a step of 0.4 m, between 5 and 45 m; and the same one between 5 and 5.2 m elsewhere.
+
+    A corner of 7 cm in another wall stays with the finer clearance alone.
+    """
+    low = Polygon([(0, 0), (10, 0), (10, 5), (10.4, 5), (10.4, 10), (5, 10.07), (0, 10)])
     pair = np.array([low, box(0, 0, 20, 10) - low], dtype=object)
     houses = np.concatenate((pair, shapely.transform(pair, lambda xy: xy + 100.0)))
     roofs, cluster = flat_roofs(np.array([5.0, 45.0, 5.0, 5.2])), np.array([0, 0, 1, 1])
@@ -243,6 +246,8 @@ def test_a_cluster_whose_roofs_would_be_off_keeps_a_finer_clearance() -> None:
     coarse, fine = shape(0.0), shape(0.3)
     assert set(coarse.clearance.tolist()) == {EPS}
     assert fine.clearance[np.argsort(fine.house)].tolist() == [0.3, 0.3, EPS, EPS]
+    outlines = [city.polygons[np.argmin(city.house)].exterior.coords for city in (coarse, fine)]
+    assert [(5.0, 10.07) in outline for outline in outlines] == [False, True]
     territories = Territories(shapely.transform(houses, lambda xy: xy * 1000), np.arange(4), cluster)
     for city, off in ((coarse, 40 * 0.1), (fine, 0.0)):  # a triangle of 1 m2, or none, of 100 m2
         faces = shapely.transform(city.polygons, lambda xy: xy * 1000)

@@ -25,6 +25,7 @@ from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.serving.bodies import MOST_BYTES, make_asked
 from tiler.serving.edit_queue import REST, EditQueue
 from tiler.serving.serve import FOLDER, serve_city, view_city
+from tiler.store.folder_lock import only_run
 from tiler.store.out_folder import CITY_MODEL
 from tiler.tiles3d.globe import Globe, geocentric
 from tiler.tiles3d.slices import cut_pieces, make_slices
@@ -186,6 +187,8 @@ def test_a_city_that_is_shown_is_not_edited(viewed: tuple[str, Path], url: str) 
             assert answer.headers["Citystitch-Section"] == "yes"  # by which the page offers it
     assert ask(viewed[0], "/edits", {"action": "remove", "building": "x"})[0] >= 400
     assert ask(viewed[0], "/city")[0] == 404
+    with pytest.raises(ConfigError, match="is at work"), only_run(viewed[1]):
+        pass
 
 
 def test_others_need_the_token(small_run: Path, tmp_path: Path) -> None:
