@@ -28,7 +28,7 @@ from tiler.monitoring.events import read_events
 KEPT = DOCS / "benchmarks.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
 BUILDINGS = (100, 300, 1000, 3000, 10_000, 20_000, 50_000)
-SIDES = (1000, 2000, 3000, 5000, 10_000)  # m
+SIDES = (1000, 2000, 3000)  # m
 TILES_A_SIDE = (8, 16, 32)
 TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
 PACKAGES = ("pipeline", "stitch", "tiler")
