@@ -645,11 +645,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         },
         "compression": {"choices": ("draco",), "help": "pack the meshes of 3D Tiles (default: not)"},
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
-        "workers": {
-            "type": int,
-            "metavar": "N",
-            "help": "threads or processes that write (default: 0, one)",
-        },
+        "workers": {"type": int, "metavar": "N", "help": "threads that write (default: 0, one)"},
     }
     for option, words in given.items():
         export.add_argument(

@@ -100,7 +100,7 @@ def item_key(
     return _hash(shared + json.dumps(parts).encode()).hex()
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class OpenKey:
     """What the key of a result is made of; what a submission makes before it is left open.
 

@@ -206,19 +206,8 @@ class Schedule:
         made = self._make_key(ticket, refs, before)
         key = None if made.awaited() else made.close({}, engine.store)[0]
         task = Task(
-            *(
-                stage,
-                name,
-                scope,
-                made.box,
-                planned.parameters,
-                engine.context,
-                path,
-                engine.store,
-                refs,
-                key or "",
-            ),
-            *(engine.store.path.parent, frame, share),
+            *(stage, name, scope, made.box, planned.parameters, engine.context, path, engine.store),
+            *(refs, key or "", engine.store.path.parent, frame, share),
             former="" if key is None else self._former_key(planned.stage, made),
         )
         return Part(planned.stage.function, task, made if key is None else None)
@@ -251,9 +240,7 @@ class Schedule:
         if not known:
             return None
         record, made, state = known
-        same = (
-            vars(self._make_key(ticket, refs, {})) == made and file_state(engine.store.file(stage, name)) == state
-        )
+        same = self._make_key(ticket, refs, {}) == made and file_state(engine.store.file(stage, name)) == state
         if not same or find_changed_files(engine.store.path.parent, record.facts.get(FILES, {})):
             return None
         found: Record = record
@@ -264,14 +251,11 @@ class Schedule:
         engine, item = self.engine, self._item(ticket)
         if engine.known is None or in_bucket(engine.store.path):
             return
-        if item in engine.known or len(engine.known) < MOST_KNOWN:
-            refs, _ = self._find_reads(ticket, {})
-            made, state = vars(self._make_key(ticket, refs, {})), file_state(engine.store.file(*item))
-            engine.known[item] = (
-                replace(record, seconds={}, peak_memory=0, reused=True, damage="", ago=0.0),
-                made,
-                state,
-            )
+        state = file_state(engine.store.file(*item))
+        if state and (item in engine.known or len(engine.known) < MOST_KNOWN):
+            made = self._make_key(ticket, self._find_reads(ticket, {})[0], {})
+            reused = replace(record, seconds={}, peak_memory=0, reused=True, damage="", ago=0.0)
+            engine.known[item] = (reused, made, state)
 
     def _former_key(self, stage: Stage, key: OpenKey) -> str:
         """Key of the same result before changes that do not reach it; nothing where there is none."""

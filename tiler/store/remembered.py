@@ -18,13 +18,13 @@ MOST = 2**28  # bytes of all that is remembered; what comes then is looked for e
 
 @dataclass
 class _Known:
-    """By device, inode and what is looked for: size and time of the file, and what was found.
+    """By device, inode and what is looked for: state of the file, and what was found.
 
     A file that takes the inode of one that is gone takes its place here too, so a process keeps no more than there
     are files.
     """
 
-    found: dict[tuple[object, ...], tuple[tuple[int, int], bytes]] = field(default_factory=dict)
+    found: dict[tuple[object, ...], tuple[tuple[int, ...], bytes]] = field(default_factory=dict)
     n_bytes: int = 0
     results: dict[tuple[str, str], Any] = field(default_factory=dict)
 
@@ -52,12 +52,12 @@ def remembered_results() -> dict[tuple[str, str], Any] | None:
 
 
 def file_state(path: Path) -> tuple[int, ...]:
-    """Give what changes when a file is written anew: device, inode, size and time; nothing where there is none."""
+    """Give device, inode, size and time of a file, of which one changes when it is written anew; else nothing."""
     try:
         stat = os.stat(path)
     except OSError:
         return ()
-    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
+    return (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns) if S_ISREG(stat.st_mode) else ()
 
 
 def remember(
@@ -92,13 +92,10 @@ def remember(
     known = _KNOWN.get()
     if known is None or in_bucket(path):
         return look()
-    try:
-        stat = os.stat(path)
-    except OSError:
+    state = file_state(path)
+    if not state or (largest is not None and state[2] > largest):
         return look()
-    if not S_ISREG(stat.st_mode) or (largest is not None and stat.st_size > largest):
-        return look()
-    key, state = (stat.st_dev, stat.st_ino, *what), (stat.st_size, stat.st_mtime_ns)
+    key = (*state[:2], *what)
     if key in known.found and known.found[key][0] == state:
         stored: Any = pickle.loads(known.found[key][1])
         return stored  # type: ignore[no-any-return]
