@@ -20,8 +20,9 @@ from tiler.check.solid_proofs import check_crs, check_solids, read_outlines
 from tiler.check.zone_proofs import check_zones, prove_sizes_of_zones, read_given_blocks
 from tiler.citymodels.building_index import BuildingIndex, copy_vertices, index_buildings, open_vertices
 from tiler.executors.dask_settings import FREED, start_fork_server
-from tiler.executors.in_order import check_workers, map_in_order
+from tiler.executors.in_order import map_in_order
 from tiler.mesh_files.mesh_parts import report_parts
+from tiler.mesh_files.threads import check_workers
 from tiler.mesh_files.vtk_files import read_piece_paths
 from tiler.store.kept import IN_PIECES, need
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE

@@ -127,7 +127,8 @@ def _objects_of(path: Path, document: dict[str, Any]) -> Object:
             raise InputError(f"{path}: the city object {name} is no JSON object; write it anew")
         for key, kind in _MEMBERS.items():
             if not isinstance(thing.get(key) or kind(), kind):
-                raise InputError(f"{path}: the {key} of {name} have the wrong type; write it anew")
+                has = "has" if key == "geometry" else "have"
+                raise InputError(f"{path}: the {key} of {name} {has} the wrong type; write it anew")
     return objects
 
 

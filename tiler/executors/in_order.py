@@ -3,7 +3,6 @@
 from collections.abc import Callable, Generator, Iterable, Mapping
 from typing import TypeVar
 
-from pipeline.data.errors import ConfigError
 from tiler.engine.task_limits import Limits, share_memory
 from tiler.executors.dask_executor import ClusterError
 from tiler.executors.dask_settings import ENVIRONMENT
@@ -13,12 +12,6 @@ AHEAD = 4  # items for each worker that are submitted before the first of them i
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-
-def check_workers(workers: int) -> None:
-    """Raise ConfigError if there cannot be so many workers."""
-    if workers < 0:
-        raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
 
 
 def map_in_order(

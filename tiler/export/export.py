@@ -24,6 +24,7 @@ from tiler.mesh_files.run_files import (
     take_largest_part,
     take_origin,
 )
+from tiler.mesh_files.threads import check_workers
 
 EXPORT_RECORD = "export.json"  # in every folder that was exported: only such a one is ever replaced
 LARGEST_PART = "largest_part"  # taken by every format of the mesh, not by those of the city model
@@ -108,8 +109,7 @@ def export_run(
             raise ConfigError(
                 f"--{option.replace('_', '-')}: format {name} does not take it; its options: {taken}"
             )
-    if options.get(WORKERS, 0) < 0:
-        raise ConfigError(f"--workers {options[WORKERS]}: expected 0, for this process, or more")
+    check_workers(options.get(WORKERS, 0))
     asked = options.get("buildings", kind.buildings[0])
     if asked not in kind.buildings:
         raise ConfigError(f"--buildings {asked}: format {name} takes {' or '.join(kind.buildings)}")

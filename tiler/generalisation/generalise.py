@@ -31,6 +31,7 @@ from tiler.generalisation.summary import LevelSum, Told, describe_levels, table_
 from tiler.generalisation.tile_cells import Work, meet_tiles, pair_buildings, part_tile, sort_buildings
 from tiler.generalisation.tile_levels import make_cells, make_levels
 from tiler.georeference.crs import box_words, crs_text
+from tiler.mesh_files.threads import check_workers
 from tiler.store.atomic import replacing
 from tiler.vectors.features import to_objects
 from tiler.vectors.gdal_layer import list_some
@@ -106,8 +107,7 @@ def generalise(
         raise ConfigError(f"{output}: a GeoPackage ends with .gpkg; rename --output")
     if not output.parent.is_dir():
         raise ConfigError(f"{output.parent}: no such folder; make it, or give another --output")
-    if workers < 0:
-        raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
+    check_workers(workers)
     lines = [*inputs.roads, *inputs.railways, *inputs.water, *inputs.others]
     given = [
         *inputs.models,

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, cut_city, make_city
 from pipeline.points_terrain.synthetic_roofs import ROOF_TYPES, wing_rings
-from tiler.executors.in_order import check_workers, map_in_order
+from tiler.executors.in_order import map_in_order
 from tiler.formats.gpkg import fixed_time
+from tiler.mesh_files.threads import check_workers
 from tiler.towns.synthetic_files import DAY, write_laz
 
 CRS = "EPSG:3006"

@@ -8,8 +8,16 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
+from pipeline.data.errors import ConfigError
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+def check_workers(workers: int) -> None:
+    """Raise ConfigError if there cannot be so many workers."""
+    if workers < 0:
+        raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
 
 
 def map_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Generator[Result]:

@@ -16,9 +16,10 @@ from pipeline.data.errors import ConfigError
 from tiler.convert.convert import refuse_output
 from tiler.convert.features import origin_of
 from tiler.convert.inputs import open_source
-from tiler.executors.in_order import check_workers, map_in_order
+from tiler.executors.in_order import map_in_order
 from tiler.export.export import EXPORT_RECORD
 from tiler.georeference.crs import crs_text
+from tiler.mesh_files.threads import check_workers
 from tiler.store.atomic import replacing_folder
 from tiler.textures.camera_files import read_cameras, usable_cameras
 from tiler.textures.cameras import Array, Camera

@@ -19,8 +19,9 @@ from pipeline.architecture.parameters import House
 from pipeline.architecture.representations import list_representations
 from pipeline.data.errors import ConfigError, OutputError
 from pipeline.points_terrain.synthetic import ORIGIN
-from tiler.executors.in_order import check_workers, map_in_order
+from tiler.executors.in_order import map_in_order
 from tiler.formats.gpkg import Column, fixed_time, write_rows
+from tiler.mesh_files.threads import check_workers
 from tiler.towns.parameter_files import XML_END, XML_HEAD
 from tiler.towns.rule_files import read_rules
 from tiler.towns.styles import Box, Town, make_town
