@@ -57,7 +57,8 @@ def serve_tiles(folder: Path, address: str) -> Iterator[str]:
     """
     if not (folder / TILESET).is_file():
         raise InputError(
-            f"{folder}: has no {TILESET}; write one by citystitch export RUN --format 3dtiles -o tiles"
+            f"{folder}: has no {TILESET}; write one by citystitch export RUN --format 3dtiles -o tiles, or name "
+            "the folder of a finished run"
         )
 
     def rules(loopback: bool) -> list[Any]:
